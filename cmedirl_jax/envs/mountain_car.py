@@ -1,0 +1,102 @@
+"""MountainCarContinuous-v0 in pure JAX, step for step Gymnasium's.
+
+Source: Gymnasium 1.4.0, `gymnasium/envs/classic_control/continuous_mountain_car.py`. Two details
+that other ports miss: the *force* uses the clipped action while the *cost* uses the action as
+given, and the velocity is zeroed at the left wall (not at the goal). Gymnasium evaluates the cosine
+in double precision; this version is float32 throughout and agrees to 1e-7 per step.
+"""
+
+import chex
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax.envs.base import Env, Step
+from cmedirl_jax.types import EnvSpec
+
+
+@flax.struct.dataclass
+class MountainCarParams:
+    """Physics, as traced leaves. Positions and velocities are in the units of Gymnasium's car."""
+
+    power: chex.Numeric = 0.0015
+    gravity: chex.Numeric = 0.0025
+    max_speed: chex.Numeric = 0.07
+    min_position: chex.Numeric = -1.2
+    max_position: chex.Numeric = 0.6
+    goal_position: chex.Numeric = 0.45
+    goal_velocity: chex.Numeric = 0.0
+    goal_reward: chex.Numeric = 100.0
+    action_cost: chex.Numeric = 0.1
+    start_low: chex.Numeric = -0.6
+    start_high: chex.Numeric = -0.4
+    max_episode_steps: chex.Numeric = 999
+
+
+@flax.struct.dataclass
+class MountainCarState:
+    """The car. `time` counts the steps of the episode so far."""
+
+    position: chex.Array
+    velocity: chex.Array
+    time: chex.Array
+
+
+SPEC = EnvSpec(
+    id="MountainCarContinuous-v0",
+    observation_dim=2,
+    action_dim=1,
+    observation_low=np.array([-1.2, -0.07], np.float32),
+    observation_high=np.array([0.6, 0.07], np.float32),
+    action_low=np.array([-1.0], np.float32),
+    action_high=np.array([1.0], np.float32),
+    max_episode_steps=999,
+    reward_threshold=90.0,
+)
+
+
+def make() -> Env:
+    """The environment with Gymnasium's physics as default parameters."""
+    return Env(SPEC, MountainCarParams(), reset, step, starts)
+
+
+def reset(
+    key: chex.PRNGKey, params: MountainCarParams
+) -> tuple[MountainCarState, chex.Array]:
+    """Start at rest, at a position drawn from U(start_low, start_high)."""
+    position = jax.random.uniform(key, minval=params.start_low, maxval=params.start_high)
+    return _at_rest(position)
+
+
+def starts(count: int, params: MountainCarParams) -> tuple[MountainCarState, chex.Array]:
+    """`count` start states at rest, evenly spaced over the start interval, its ends included."""
+    return jax.vmap(_at_rest)(jnp.linspace(params.start_low, params.start_high, count))
+
+
+def step(
+    key: chex.PRNGKey, state: MountainCarState, action: chex.Array, params: MountainCarParams
+) -> tuple[MountainCarState, Step]:
+    """Advance the car; deterministic, so `key` goes unused. `action` is `[1]`."""
+    del key
+    force = jnp.clip(action[0], SPEC.action_low[0], SPEC.action_high[0])
+    velocity = state.velocity + (
+        force * params.power - params.gravity * jnp.cos(3.0 * state.position)
+    )
+    velocity = jnp.clip(velocity, -params.max_speed, params.max_speed)
+    position = jnp.clip(state.position + velocity, params.min_position, params.max_position)
+    velocity = jnp.where((position == params.min_position) & (velocity < 0), 0.0, velocity)
+    terminated = (position >= params.goal_position) & (velocity >= params.goal_velocity)
+    reward = params.goal_reward * terminated - params.action_cost * jnp.square(action[0])
+    new_state = MountainCarState(position, velocity, state.time + 1)
+    truncated = new_state.time >= params.max_episode_steps
+    return new_state, Step(_observe(new_state), reward, terminated, truncated)
+
+
+def _at_rest(position: chex.Array) -> tuple[MountainCarState, chex.Array]:
+    state = MountainCarState(position, jnp.zeros_like(position), jnp.zeros((), jnp.int32))
+    return state, _observe(state)
+
+
+def _observe(state: MountainCarState) -> chex.Array:
+    return jnp.stack([state.position, state.velocity])

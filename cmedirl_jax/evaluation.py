@@ -1,0 +1,99 @@
+"""Noise-free evaluation of a policy on fixed start states."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from cmedirl_jax.envs import Env
+
+
+class Rollouts(NamedTuple):
+    """`B` finished episodes.
+
+    Attributes:
+        episode_return: `[B]`, undiscounted, of the environment's own reward.
+        length: `[B]` int32.
+        terminated: `[B]` bool; for a goal-reaching task, whether the goal was reached.
+    """
+
+    episode_return: chex.Array
+    length: chex.Array
+    terminated: chex.Array
+
+
+class Evaluation(NamedTuple):
+    """Statistics over the start states, all `[]`.
+
+    Attributes:
+        return_mean: mean undiscounted return.
+        return_std: standard deviation of the return over the starts.
+        goal_fraction: share of the episodes that terminated before the time limit.
+        length_mean: mean episode length.
+    """
+
+    return_mean: chex.Array
+    return_std: chex.Array
+    goal_fraction: chex.Array
+    length_mean: chex.Array
+
+
+def rollout(
+    policy: Callable[[chex.Array], chex.Array],
+    env: Env,
+    params: Any,
+    starts: tuple[Any, chex.Array],
+    key: chex.PRNGKey | None = None,
+) -> Rollouts:
+    """Run `B` episodes side by side to their ends; stops as soon as the last one has ended.
+
+    Args:
+        policy: observations `[B, O]` -> actions `[B, A]`.
+        env: the environment.
+        params: its parameters.
+        starts: states and observations with a leading axis `B`, as `env.starts` gives them.
+        key: for environments that draw in `step`; default a fixed key.
+    """
+    states, observations = starts
+    count = observations.shape[0]
+    key = jax.random.key(0) if key is None else key
+
+    def running(carry) -> chex.Array:
+        return ~jnp.all(carry[2])
+
+    def advance(carry):
+        states, observations, done, result, time = carry
+        keys = jax.random.split(jax.random.fold_in(key, time), count)
+        states, step = jax.vmap(env.step, in_axes=(0, 0, 0, None))(
+            keys, states, policy(observations), params
+        )
+        result = Rollouts(
+            episode_return=result.episode_return + jnp.where(done, 0.0, step.reward),
+            length=result.length + ~done,
+            terminated=result.terminated | (step.terminated & ~done),
+        )
+        return states, step.observation, done | step.terminated | step.truncated, result, time + 1
+
+    nothing = jnp.zeros(count, bool)
+    result = Rollouts(jnp.zeros(count), jnp.zeros(count, jnp.int32), nothing)
+    carry = (states, observations, nothing, result, jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(running, advance, carry)[3]
+
+
+def summarise(rollouts: Rollouts) -> Evaluation:
+    """Reduce the episodes to their statistics."""
+    return Evaluation(
+        return_mean=jnp.mean(rollouts.episode_return),
+        return_std=jnp.std(rollouts.episode_return),
+        goal_fraction=jnp.mean(rollouts.terminated.astype(jnp.float32)),
+        length_mean=jnp.mean(rollouts.length.astype(jnp.float32)),
+    )
+
+
+def evaluate(
+    policy: Callable[[chex.Array], chex.Array], env: Env, params: Any, starts: int
+) -> Evaluation:
+    """Evaluate `policy` on `starts` start states, evenly spread and the same at every call."""
+    return summarise(rollout(policy, env, params, env.starts(starts, params)))

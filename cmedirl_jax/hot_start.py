@@ -1,0 +1,183 @@
+"""Hot start of actor and critic from demonstrations (the paper, section 3.4 and Eq. 11).
+
+The actor is regressed on the demonstrated actions. The critic is a 'DAQN': its values at `cells`
+evenly spaced actions are pushed towards a target that singles out the demonstrated one. What the
+paper writes (a softmax over actions, a squared error to a one-hot array) fits no continuous critic
+as it stands; the three readings are the values of `HotStartHParams.critic`:
+
+- "softmax" (H0, the letter): sum_k [softmax(Q(s, a_1..K))_k - 1{k = demonstrated cell}]^2
+- "one-hot" (H1): sum_k [Q(s, a_k) - 1{k = demonstrated cell}]^2, where the demonstrated action
+  itself replaces the cell nearest to it
+- "quadratic" (H2): sum_k [Q(s, a_k) - (G(s) - curvature |a_k - a_demo|^2)]^2, with G the discounted
+  return that the demonstration went on to receive: values on the scale of returns
+"""
+
+from typing import Literal, NamedTuple
+
+import chex
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from cmedirl_jax import demonstrations as demonstrations_lib
+from cmedirl_jax import networks as networks_lib
+from cmedirl_jax.demonstrations import Demonstrations, DemonstrationSubset
+from cmedirl_jax.networks import ActorCritic
+from cmedirl_jax.types import EnvSpec, Params, Transition
+
+
+@flax.struct.dataclass
+class HotStartHParams:
+    """Hyperparameters; the strings and sizes are static."""
+
+    learning_rate: float = 1e-3
+    """Adam's rate for both networks."""
+    curvature: float = 20.0
+    """Of the "quadratic" critic target, per squared half-width of the action range."""
+    discount: float = flax.struct.field(pytree_node=False, default=0.99)
+    """Discount of the returns that the "quadratic" critic target needs."""
+    critic: Literal["softmax", "one-hot", "quadratic"] = flax.struct.field(
+        pytree_node=False, default="one-hot"
+    )
+    """The critic's loss: H0, H1 or H2, see the module's docstring."""
+    cells: int = flax.struct.field(pytree_node=False, default=11)
+    """Evenly spaced values per action dimension, bounds included; K = cells^A actions."""
+    steps: int = flax.struct.field(pytree_node=False, default=1000)
+    """Gradient steps on each network."""
+    batch_size: int = flax.struct.field(pytree_node=False, default=32)
+    """Demonstrated steps per gradient step."""
+
+
+class HotStartData(NamedTuple):
+    """A pool as the hot start reads it.
+
+    Attributes:
+        transition: leaves `[N, ...]`.
+        discounted_return: `[N]`, what each step went on to receive.
+        episodes: where the pool's episodes lie.
+    """
+
+    transition: Transition
+    discounted_return: chex.Array
+    episodes: DemonstrationSubset
+
+
+def data(demonstrations: Demonstrations, discount: float) -> HotStartData:
+    """Prepare a pool (on the host, once)."""
+    return HotStartData(
+        demonstrations.transition,
+        demonstrations_lib.discounted_returns(demonstrations, discount),
+        demonstrations_lib.episodes(demonstrations),
+    )
+
+
+def fit(
+    key: chex.PRNGKey,
+    networks: ActorCritic,
+    params: tuple[Params, Params],
+    demonstrations: Demonstrations | HotStartData,
+    hparams: HotStartHParams | None = None,
+    *,
+    subset: DemonstrationSubset | None = None,
+) -> tuple[Params, Params]:
+    """Fit actor and critic to demonstrations by supervised learning; optimisers are fresh.
+
+    Follow it with `agent.init(key, params)`, which copies the result to the targets.
+
+    Args:
+        key: randomness of the minibatches.
+        networks: whose parameters these are.
+        params: `(actor, critic)` to start from.
+        demonstrations: the pool; under jit or vmap, prepare it with `data` first.
+        hparams: hyperparameters.
+        subset: the learner's own episodes of the pool; default all.
+
+    Returns:
+        The fitted `(actor, critic)`.
+    """
+    hparams = hparams or HotStartHParams()
+    if isinstance(demonstrations, Demonstrations):
+        demonstrations = data(demonstrations, hparams.discount)
+    pool = jax.tree.map(jnp.asarray, demonstrations)
+    subset = subset if subset is not None else pool.episodes
+    optimizer = optax.adam(hparams.learning_rate)
+
+    def loss(params: tuple[Params, Params], index: chex.Array):
+        actor, critic = params
+        observation = pool.transition.observation[index]
+        action = pool.transition.action[index]
+        actor_error, actor = actor_loss(networks, actor, observation, action)
+        critic_error, critic = critic_loss(
+            networks, critic, hparams, observation, action, pool.discounted_return[index]
+        )
+        # Disjoint parameters: the gradient of the sum is each network's own.
+        return actor_error + critic_error, (actor, critic)
+
+    def step(carry, key):
+        params, state = carry
+        index = demonstrations_lib.sample_index(key, subset, hparams.batch_size)
+        grads, params = jax.grad(loss, has_aux=True)(params, index)
+        updates, state = optimizer.update(grads, state, params)
+        return (optax.apply_updates(params, updates), state), None
+
+    (params, _), _ = jax.lax.scan(
+        step, (params, optimizer.init(params)), jax.random.split(key, hparams.steps)
+    )
+    return params
+
+
+def actor_loss(
+    networks: ActorCritic, actor: Params, observation: chex.Array, action: chex.Array
+) -> tuple[chex.Array, Params]:
+    """Mean squared error of mu(s) to the demonstrated action: `[B, O]`, `[B, A]` -> `[]`."""
+    pre_activation, actor = networks_lib.train_mode(networks.actor)(actor, observation)
+    return jnp.mean(jnp.square(networks.squash(pre_activation) - action)), actor
+
+
+def critic_loss(
+    networks: ActorCritic,
+    critic: Params,
+    hparams: HotStartHParams,
+    observation: chex.Array,
+    action: chex.Array,
+    discounted_return: chex.Array,
+) -> tuple[chex.Array, Params]:
+    """Eq. 11 in the reading that `hparams.critic` names, averaged over the batch, and the params.
+
+    Args:
+        networks: whose critic.
+        critic: its parameters.
+        hparams: which reading, how many cells.
+        observation: `[B, O]`.
+        action: `[B, A]`, demonstrated.
+        discounted_return: `[B]`, read by "quadratic" alone.
+    """
+    spec = networks.spec
+    half_width = 0.5 * (spec.action_high - spec.action_low)
+    cells = jnp.asarray(action_cells(spec, hparams.cells))
+    squared_distance = jnp.sum(
+        jnp.square((cells - action[:, None, :]) / half_width), axis=-1
+    )  # [B, K]
+    nearest = jax.nn.one_hot(jnp.argmin(squared_distance, axis=-1), len(cells))
+    actions = jnp.broadcast_to(cells, (*squared_distance.shape, spec.action_dim))
+    if hparams.critic == "one-hot":
+        actions = jnp.where(nearest[..., None] > 0, action[:, None, :], actions)
+    observations = jnp.broadcast_to(
+        observation[:, None, :], (*squared_distance.shape, spec.observation_dim)
+    )
+    q, critic = networks_lib.train_mode(networks.critic)(critic, observations, actions)
+    if hparams.critic == "quadratic":
+        target = discounted_return[:, None] - hparams.curvature * squared_distance
+    else:
+        target = nearest
+    if hparams.critic == "softmax":
+        q = jax.nn.softmax(q, axis=-1)
+    return jnp.mean(jnp.sum(jnp.square(q - target), axis=-1)), critic
+
+
+def action_cells(spec: EnvSpec, cells: int) -> np.ndarray:
+    """The product grid of `cells` values per action dimension, bounds included: `[cells^A, A]`."""
+    axes = np.linspace(spec.action_low, spec.action_high, cells).T
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, spec.action_dim)

@@ -1,0 +1,156 @@
+"""The paper's four methods, each one line: what it adds to DDPG, and the settings they share."""
+
+import dataclasses
+from typing import Literal, NamedTuple
+
+from cmedirl_jax import ddpg, exploration, irl, networks, replay, rewards
+from cmedirl_jax.ddpg import DDPG, DDPGHParams
+from cmedirl_jax.exploration import (
+    EpsilonGreedyHParams,
+    Exploration,
+    GaussianHParams,
+    OrnsteinUhlenbeckHParams,
+)
+from cmedirl_jax.hot_start import HotStartHParams
+from cmedirl_jax.irl import IRLHParams, RewardLearner
+from cmedirl_jax.networks import Architecture
+from cmedirl_jax.replay import Replay
+from cmedirl_jax.types import EnvSpec
+
+
+class Method(NamedTuple):
+    """A method as a composition of the library's parts.
+
+    Attributes:
+        name: as the command line and the tables write it.
+        description: in a line.
+        hot_start: whether actor and critic start from the demonstrations (Eq. 11).
+        learned_reward: whether r_D is learned (Algorithm 1) and added to r_e (Eq. 10).
+    """
+
+    name: str
+    description: str
+    hot_start: bool = False
+    learned_reward: bool = False
+
+    @property
+    def uses_demonstrations(self) -> bool:
+        """Whether the method reads demonstrations at all."""
+        return self.hot_start or self.learned_reward
+
+
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        Method("ddpg", "DDPG on the environment's reward, no demonstrations"),
+        Method("hs-ddpg", "DDPG, actor and critic hot-started", hot_start=True),
+        Method("me-ddpg", "DDPG on r_D + r_e", learned_reward=True),
+        Method("hs-me-ddpg", "both (Algorithm 2)", hot_start=True, learned_reward=True),
+    )
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ExplorationSettings:
+    """The behaviour policy."""
+
+    kind: Literal["ornstein-uhlenbeck", "gaussian", "epsilon-greedy"] = "ornstein-uhlenbeck"
+    """Which noise; the options of the others are ignored."""
+    ornstein_uhlenbeck: OrnsteinUhlenbeckHParams = OrnsteinUhlenbeckHParams()
+    gaussian: GaussianHParams = GaussianHParams()
+    epsilon_greedy: EpsilonGreedyHParams = EpsilonGreedyHParams()
+
+
+@dataclasses.dataclass(frozen=True)
+class RewardSchedule:
+    """When the reward is learned, and from what."""
+
+    period: int = 4
+    """Environment steps between updates of the reward."""
+    iterations: int = 1
+    """Iterations K of Algorithm 1 at each update."""
+    stop: int | None = 2000
+    """Environment step from which r_D is frozen (and kept); None: never."""
+    anneal_steps: int | None = None
+    """Environment steps over which the weight of r_D falls linearly to 0; None: stays 1."""
+    batch_size: int = 32
+    """Demonstrated pairs per update, and background pairs per update."""
+    recent: int | None = 2000
+    """Background: the latest transitions of the replay; None: all collected so far."""
+    storage: Literal["recompute", "store"] = "recompute"
+    """Compute r_D anew when a transition is sampled, or store r* = r_D + r_e at collection."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of each hidden layer of the reward network."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """The training loop."""
+
+    batch_size: int = 32
+    """Transitions per update."""
+    replay_capacity: int | None = None
+    """Transitions the replay holds; None: every one of the run."""
+    learning_starts: int = 200
+    """Environment steps before the first update."""
+    update_period: int = 1
+    """Environment steps between updates of actor and critic."""
+    target_period: int = 1
+    """Environment steps between target updates (the paper: 300, with agent.tau 1)."""
+    behaviour_cloning_steps: int = 4000
+    """Environment steps over which agent.behaviour_cloning falls linearly to 0."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Every choice of an experiment that is not its size. The defaults are the `tuned` preset."""
+
+    architecture: Architecture = Architecture()
+    agent: DDPGHParams = DDPGHParams(behaviour_cloning=1.0)
+    exploration: ExplorationSettings = ExplorationSettings()
+    reward: IRLHParams = IRLHParams()
+    reward_schedule: RewardSchedule = RewardSchedule()
+    hot_start: HotStartHParams = HotStartHParams()
+    schedule: Schedule = Schedule()
+
+
+class Algorithm(NamedTuple):
+    """A method's parts, made for an environment.
+
+    Attributes:
+        agent: DDPG.
+        learner: learner of r_D, or None.
+        exploration: the behaviour policy.
+        replay: the buffer.
+    """
+
+    agent: DDPG
+    learner: RewardLearner | None
+    exploration: Exploration
+    replay: Replay
+
+
+def compose(spec: EnvSpec, method: Method, settings: Settings, capacity: int) -> Algorithm:
+    """Make a method's parts; `capacity` is the replay's where the settings leave it open."""
+    learner = irl.make(
+        spec, settings.reward, network=rewards.mlp(spec, settings.reward_schedule.hidden)
+    )
+    return Algorithm(
+        agent=ddpg.make(
+            spec, settings.agent, networks=networks.make(spec, settings.architecture)
+        ),
+        learner=learner if method.learned_reward else None,
+        exploration=make_exploration(spec, settings.exploration),
+        replay=replay.make(spec, settings.schedule.replay_capacity or capacity),
+    )
+
+
+def make_exploration(spec: EnvSpec, settings: ExplorationSettings) -> Exploration:
+    """The behaviour policy that `settings.kind` names."""
+    match settings.kind:
+        case "ornstein-uhlenbeck":
+            return exploration.ornstein_uhlenbeck(spec, settings.ornstein_uhlenbeck)
+        case "gaussian":
+            return exploration.gaussian(spec, settings.gaussian)
+        case "epsilon-greedy":
+            return exploration.epsilon_greedy(spec, settings.epsilon_greedy)

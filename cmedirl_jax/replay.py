@@ -1,0 +1,125 @@
+"""A ring buffer of transitions with uniform sampling (the paper's 'replay memory', section 4.1).
+
+A transition lies in one row of a packed `[capacity, D]` array: adding is one contiguous write and a
+minibatch one gather. The only counter is the number of transitions ever added; who fills many
+buffers in step may carry that number once, unbatched (`training` does).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import chex
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from cmedirl_jax.types import EnvSpec, Transition
+
+
+@flax.struct.dataclass
+class ReplayState:
+    """The buffer: `storage` `[capacity, D]` float32 and `count` `[]` int32, transitions ever added.
+
+    Row `count % capacity` is written next; `min(count, capacity)` rows are filled.
+    """
+
+    storage: chex.Array
+    count: chex.Array
+
+
+class Replay(NamedTuple):
+    """A replay buffer as pure functions.
+
+    Attributes:
+        init: `() -> ReplayState`, empty.
+        add: `(state, transition) -> ReplayState`; overwrites the oldest once full.
+        sample: `(key, state, batch_size, recent=None) -> Transition` with leaves `[batch_size, ...]`,
+            uniform with replacement over what is there, or over its `recent` latest transitions.
+            An empty buffer gives zeros.
+        draw: `(key, batch_size) -> bits`, the randomness of `sample`, to draw ahead of time.
+        take: `(state, bits, recent=None) -> Transition`; `sample` is `take` of `draw`.
+    """
+
+    init: Callable[[], ReplayState]
+    add: Callable[[ReplayState, Transition], ReplayState]
+    sample: Callable[..., Transition]
+    draw: Callable[[chex.PRNGKey, int], chex.Array]
+    take: Callable[..., Transition]
+
+
+def make(spec: EnvSpec, capacity: int) -> Replay:
+    """A replay buffer of `capacity` transitions of `spec`'s sizes.
+
+    Raises:
+        ValueError: if `capacity` is not positive.
+    """
+    if capacity < 1:
+        raise ValueError(f"replay capacity must be positive, got {capacity}")
+
+    def init() -> ReplayState:
+        return ReplayState(jnp.zeros((capacity, row_size(spec))), jnp.zeros((), jnp.int32))
+
+    def add(state: ReplayState, transition: Transition) -> ReplayState:
+        row = pack(spec, transition)
+        position = state.count % capacity
+        return ReplayState(state.storage.at[position].set(row), state.count + 1)
+
+    def draw(key: chex.PRNGKey, batch_size: int) -> chex.Array:
+        return jax.random.bits(key, (batch_size,), jnp.uint32)
+
+    def take(state: ReplayState, bits: chex.Array, recent: int | None = None) -> Transition:
+        size = jnp.minimum(state.count, capacity if recent is None else min(recent, capacity))
+        # The bias of a remainder is below size / 2^32: nothing beside sampling noise.
+        age = (bits % jnp.maximum(size, 1).astype(jnp.uint32)).astype(jnp.int32)
+        index = (state.count - 1 - age) % capacity
+        return unpack(spec, state.storage[index])
+
+    def sample(
+        key: chex.PRNGKey, state: ReplayState, batch_size: int, recent: int | None = None
+    ) -> Transition:
+        return take(state, draw(key, batch_size), recent)
+
+    return Replay(init, add, sample, draw, take)
+
+
+def row_size(spec: EnvSpec) -> int:
+    """`D`, the floats that one packed transition takes."""
+    return 2 * spec.observation_dim + spec.action_dim + 2
+
+
+def pack(spec: EnvSpec, transition: Transition) -> chex.Array:
+    """A transition's leaves as rows `[..., D]` float32.
+
+    Raises:
+        ValueError: if a leaf's last axis is not of `spec`'s size.
+    """
+    if transition.observation.shape[-1:] != (spec.observation_dim,) or transition.action.shape[
+        -1:
+    ] != (spec.action_dim,):
+        raise ValueError(
+            f"{spec.id} has observations [..., {spec.observation_dim}] and actions "
+            f"[..., {spec.action_dim}], got {transition.observation.shape} and "
+            f"{transition.action.shape}"
+        )
+    return jnp.concatenate(
+        [
+            transition.observation,
+            transition.action,
+            jnp.asarray(transition.reward)[..., None],
+            transition.next_observation,
+            jnp.asarray(transition.terminated, jnp.float32)[..., None],
+        ],
+        axis=-1,
+    )
+
+
+def unpack(spec: EnvSpec, rows: chex.Array) -> Transition:
+    """The transition in rows `[..., D]`: the inverse of `pack`."""
+    o, a = spec.observation_dim, spec.action_dim
+    return Transition(
+        observation=rows[..., :o],
+        action=rows[..., o : o + a],
+        reward=rows[..., o + a],
+        next_observation=rows[..., o + a + 1 : 2 * o + a + 1],
+        terminated=rows[..., 2 * o + a + 1] > 0.5,
+    )

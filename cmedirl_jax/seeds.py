@@ -1,0 +1,86 @@
+"""Many independent seeds at once: vmapped in groups that fit the cache, on every device.
+
+`vmap` over a hundred seeds streams all their parameters through memory at every step. Groups of a
+few seeds, each run through its whole chunk of steps before the next begins, stay in the cache.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import chex
+import jax
+import numpy as np
+
+State = TypeVar("State")
+
+GROUP_SIZES = range(4, 11)
+"""Seeds per group that were measured to fit a core's cache at a width of 64."""
+
+
+def keys(key: chex.PRNGKey, count: int) -> chex.Array:
+    """`[count]` keys; seed i's is `fold_in(key, i)`, whatever the count."""
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, np.arange(count))
+
+
+def group_size(seeds: int, devices: int = 1, width: int = 64) -> int:
+    """How many seeds to vmap together, for the least padding; 1 for networks too wide to share.
+
+    Args:
+        seeds: how many seeds there are.
+        devices: how many devices share them.
+        width: units of the widest hidden layer.
+    """
+    per_device = -(-seeds // devices)
+    if width >= 128 or per_device < GROUP_SIZES.start:
+        return max(1, min(per_device, GROUP_SIZES.start) if width < 128 else 1)
+    return min(GROUP_SIZES, key=lambda size: (-(-per_device // size) * size, -size))
+
+
+def padded(seeds: int, group: int, devices: int = 1) -> int:
+    """The least number of seeds, at least `seeds`, that fills whole groups on every device."""
+    block = group * devices
+    return -(-seeds // block) * block
+
+
+def map_groups(function: Callable[..., State], group: int) -> Callable[..., State]:
+    """Map `function(seed_state, *shared)` over a leading axis of seeds, `group` of them at a time.
+
+    Args:
+        function: takes and returns one seed's pytree; further arguments are shared by all seeds.
+        group: seeds per `vmap`; must divide the number of seeds.
+    """
+
+    def mapped(states, *shared):
+        count = jax.tree.leaves(states)[0].shape[0]
+        if count % group:
+            raise ValueError(f"{count} seeds are not whole groups of {group}")
+        grouped = jax.tree.map(lambda x: x.reshape(count // group, group, *x.shape[1:]), states)
+        vmapped = jax.vmap(function, in_axes=(0, *(None for _ in shared)))
+        result = jax.lax.map(lambda states: vmapped(states, *shared), grouped)
+        return jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), result)
+
+    return mapped
+
+
+def map_devices(
+    function: Callable[..., State], devices: Sequence[jax.Device]
+) -> Callable[..., State]:
+    """Split the leading axis of the first argument over `devices`; share the other arguments.
+
+    Args:
+        function: maps a block of seeds, as `map_groups` returns it.
+        devices: each takes an equal share; their number must divide the number of seeds.
+    """
+    mesh = jax.sharding.Mesh(np.asarray(devices), ("seeds",))
+    split, shared_spec = jax.P("seeds"), jax.P()
+
+    def mapped(states, *shared):
+        return jax.shard_map(
+            function,
+            mesh=mesh,
+            in_specs=(split, *(shared_spec for _ in shared)),
+            out_specs=split,
+            check_vma=False,
+        )(states, *shared)
+
+    return mapped

@@ -1,0 +1,71 @@
+"""Core types: what the parts of the library pass to each other. Shapes only, no behaviour."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import chex
+import numpy as np
+
+Params = chex.ArrayTree
+"""Parameters of a network: any pytree of arrays."""
+
+
+class EnvSpec(NamedTuple):
+    """What an algorithm needs to know of an environment. `O` and `A` name the two sizes.
+
+    Attributes:
+        id: the environment's name, as Gymnasium writes it.
+        observation_dim: `O`, the length of an observation vector.
+        action_dim: `A`, the length of an action vector.
+        observation_low: `[O]` float32, lower bounds of the observations.
+        observation_high: `[O]` float32, upper bounds of the observations.
+        action_low: `[A]` float32, lower bounds of the actions.
+        action_high: `[A]` float32, upper bounds of the actions.
+        max_episode_steps: steps after which an episode is truncated.
+        reward_threshold: the mean return at which the task counts as solved.
+    """
+
+    id: str
+    observation_dim: int
+    action_dim: int
+    observation_low: np.ndarray
+    observation_high: np.ndarray
+    action_low: np.ndarray
+    action_high: np.ndarray
+    max_episode_steps: int
+    reward_threshold: float
+
+
+class Transition(NamedTuple):
+    """One step of experience, or a batch of them along any leading axes.
+
+    Attributes:
+        observation: `[..., O]` float32.
+        action: `[..., A]` float32, inside the action bounds.
+        reward: `[...]` float32, the environment's r_e.
+        next_observation: `[..., O]` float32, the true successor, also when the episode was
+            truncated (never the first observation of the next episode).
+        terminated: `[...]` bool; a time limit is not termination and still bootstraps.
+    """
+
+    observation: chex.Array
+    action: chex.Array
+    reward: chex.Array
+    next_observation: chex.Array
+    terminated: chex.Array
+
+
+class Network(NamedTuple):
+    """A function approximator as two pure functions (three when it keeps running statistics).
+
+    Attributes:
+        init: `(key) -> params`.
+        apply: `(params, *inputs) -> output`; inputs and output share their leading axes.
+        train: `(params, *inputs) -> (output, params)` for a network whose parameters hold running
+            statistics (batch normalisation): uses the batch's statistics and returns the parameters
+            with the running ones moved. None for every other network.
+    """
+
+    init: Callable[[chex.PRNGKey], Params]
+    apply: Callable[..., Any]
+    train: Callable[..., tuple[Any, Params]] | None = None
