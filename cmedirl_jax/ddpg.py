@@ -1,14 +1,13 @@
 """Deep deterministic policy gradient (Lillicrap et al. 2015), as the paper's Algorithm 2 uses it.
 
-    agent = ddpg.make(env.spec)
-    state = agent.init(jax.random.key(0))
-    state, info = jax.jit(agent.update)(state, batch)
+agent = ddpg.make(env.spec)
+state = agent.init(jax.random.key(0))
+state, info = jax.jit(agent.update)(state, batch)
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
-import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -17,12 +16,11 @@ import optax
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax import optimizers
 from cmedirl_jax.networks import ActorCritic
-from cmedirl_jax.types import EnvSpec, Params, Transition
+from cmedirl_jax.types import EnvSpec, Numeric, Params, Transition
 
 
-@flax.struct.dataclass
-class DDPGHParams:
-    """Hyperparameters. The numbers are traced leaves of the state: vmap over them, or change them."""
+class DDPGHParams(flax.struct.PyTreeNode):
+    """Hyperparameters. The numbers are traced leaves of the state, to vmap over or to change."""
 
     discount: float = 0.99
     """Discount of the return, gamma."""
@@ -42,8 +40,7 @@ class DDPGHParams:
     """Leave (1 - terminated) out of the target, as Algorithm 2 is printed."""
 
 
-@flax.struct.dataclass
-class DDPGState:
+class DDPGState(flax.struct.PyTreeNode):
     """Everything that `update` changes, and the hyperparameters it reads."""
 
     actor: Params
@@ -64,15 +61,15 @@ class DDPGInfo(NamedTuple):
         actor_loss: -Q(s, mu(s)) with its penalties; 0 where the actor was not updated.
     """
 
-    critic_loss: chex.Array
-    q_mean: chex.Array
-    actor_loss: chex.Array
+    critic_loss: jax.Array
+    q_mean: jax.Array
+    actor_loss: jax.Array
 
 
 class InitFn(Protocol):
     """Make a state."""
 
-    def __call__(self, key: chex.PRNGKey, params: tuple[Params, Params] | None = None) -> DDPGState:
+    def __call__(self, key: jax.Array, params: tuple[Params, Params] | None = None) -> DDPGState:
         """Draw `(actor, critic)` parameters, or take `params`; the targets are copies of them."""
         ...
 
@@ -86,8 +83,8 @@ class UpdateFn(Protocol):
         batch: Transition,
         demonstrations: Transition | None = None,
         *,
-        update_actor: chex.Numeric = True,
-        update_targets: chex.Numeric = True,
+        update_actor: Numeric = True,
+        update_targets: Numeric = True,
     ) -> tuple[DDPGState, DDPGInfo]:
         """Update on `batch`, leaves `[B, ...]`, whose rewards are those to learn from.
 
@@ -117,8 +114,8 @@ class DDPG(NamedTuple):
 
     networks: ActorCritic
     init: InitFn
-    act: Callable[[DDPGState, chex.Array], chex.Array]
-    value: Callable[[DDPGState, chex.Array, chex.Array], chex.Array]
+    act: Callable[[DDPGState, jax.Array], jax.Array]
+    value: Callable[[DDPGState, jax.Array, jax.Array], jax.Array]
     update: UpdateFn
 
 
@@ -137,7 +134,7 @@ def make(
         hparams: the initial hyperparameters.
         networks: default `networks.make(spec)`.
         actor_optimizer: default Adam at `state.hparams.actor_learning_rate`. Any other optax
-            transformation must hold its own rate; it may read `learning_rate=` as an extra argument.
+            transformation holds its own rate, or reads `learning_rate=` as an extra argument.
         critic_optimizer: likewise.
     """
     hparams = hparams or DDPGHParams()
@@ -145,7 +142,7 @@ def make(
     actor_tx = optax.with_extra_args_support(actor_optimizer or optimizers.adam())
     critic_tx = optax.with_extra_args_support(critic_optimizer or optimizers.adam())
 
-    def init(key: chex.PRNGKey, params: tuple[Params, Params] | None = None) -> DDPGState:
+    def init(key: jax.Array, params: tuple[Params, Params] | None = None) -> DDPGState:
         if params is None:
             actor_key, critic_key = jax.random.split(key)
             params = networks.actor.init(actor_key), networks.critic.init(critic_key)
@@ -161,10 +158,10 @@ def make(
             hparams=jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams),
         )
 
-    def act(state: DDPGState, observation: chex.Array) -> chex.Array:
+    def act(state: DDPGState, observation: jax.Array) -> jax.Array:
         return networks.squash(networks.actor.apply(state.actor, observation))
 
-    def value(state: DDPGState, observation: chex.Array, action: chex.Array) -> chex.Array:
+    def value(state: DDPGState, observation: jax.Array, action: jax.Array) -> jax.Array:
         return networks.critic.apply(state.critic, observation, action)
 
     def update_critic(state: DDPGState, batch: Transition):
@@ -204,8 +201,8 @@ def make(
         batch: Transition,
         demonstrations: Transition | None = None,
         *,
-        update_actor: chex.Numeric = True,
-        update_targets: chex.Numeric = True,
+        update_actor: Numeric = True,
+        update_targets: Numeric = True,
     ) -> tuple[DDPGState, DDPGInfo]:
         _check_batch(spec, batch, "batch")
         if demonstrations is not None:
@@ -223,11 +220,9 @@ def make(
     return DDPG(networks, init, act, value, update)
 
 
-def td_targets(networks: ActorCritic, state: DDPGState, batch: Transition) -> chex.Array:
+def td_targets(networks: ActorCritic, state: DDPGState, batch: Transition) -> jax.Array:
     """y = r + gamma (1 - terminated) Q'(s', mu'(s')), `[B]` (Algorithm 2; the mask is DDPG's)."""
-    next_action = networks.squash(
-        networks.actor.apply(state.target_actor, batch.next_observation)
-    )
+    next_action = networks.squash(networks.actor.apply(state.target_actor, batch.next_observation))
     next_value = networks.critic.apply(state.target_critic, batch.next_observation, next_action)
     if not state.hparams.bootstrap_at_termination:
         next_value = jnp.where(batch.terminated, 0.0, next_value)
@@ -235,8 +230,8 @@ def td_targets(networks: ActorCritic, state: DDPGState, batch: Transition) -> ch
 
 
 def critic_loss(
-    networks: ActorCritic, critic: Params, batch: Transition, targets: chex.Array
-) -> tuple[chex.Array, tuple[chex.Array, Params]]:
+    networks: ActorCritic, critic: Params, batch: Transition, targets: jax.Array
+) -> tuple[jax.Array, tuple[jax.Array, Params]]:
     """L = 1/B sum_i (y_i - Q(s_i, a_i))^2 (Algorithm 2), with Q `[B]` and the parameters."""
     q, critic = networks_lib.train_mode(networks.critic)(critic, batch.observation, batch.action)
     return jnp.mean(jnp.square(targets - q)), (q, critic)
@@ -249,7 +244,7 @@ def actor_loss(
     hparams: DDPGHParams,
     batch: Transition,
     demonstrations: Transition | None,
-) -> tuple[chex.Array, Params]:
+) -> tuple[jax.Array, Params]:
     """-1/B sum_i Q(s_i, mu(s_i)), whose gradient is Eq. 3's, plus the two optional penalties."""
     pre_activation, actor = networks_lib.train_mode(networks.actor)(actor, batch.observation)
     q = networks.critic.apply(critic, batch.observation, networks.squash(pre_activation))
@@ -261,7 +256,7 @@ def actor_loss(
     return loss, actor
 
 
-def _when(predicate: chex.Numeric, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
+def _when(predicate: Numeric, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
     """`lax.cond` that a Python bool resolves while tracing."""
     if isinstance(predicate, bool):
         return true_fn(operand) if predicate else false_fn(operand)
@@ -270,13 +265,13 @@ def _when(predicate: chex.Numeric, true_fn: Callable, false_fn: Callable, operan
 
 def _check_batch(spec: EnvSpec, batch: Transition, name: str) -> None:
     size = batch.observation.shape[:1]
-    expected = Transition(
-        observation=(*size, spec.observation_dim),
-        action=(*size, spec.action_dim),
-        reward=size,
-        next_observation=(*size, spec.observation_dim),
-        terminated=size,
-    )
-    found = Transition(*(jnp.shape(leaf) for leaf in batch))
+    expected = {
+        "observation": (*size, spec.observation_dim),
+        "action": (*size, spec.action_dim),
+        "reward": size,
+        "next_observation": (*size, spec.observation_dim),
+        "terminated": size,
+    }
+    found = {field: jnp.shape(leaf) for field, leaf in batch._asdict().items()}
     if not size or found != expected:
         raise ValueError(f"{name}: expected leaves of shape {expected}, got {found}")

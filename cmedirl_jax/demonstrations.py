@@ -7,15 +7,15 @@ learners with different demonstrations share one array, and nothing is ragged.
 
 import json
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.types import EnvSpec, Transition
+from cmedirl_jax.types import Array, EnvSpec, Numeric, Transition
 
 FORMAT = "cmedirl_jax.demonstrations"
 FORMAT_VERSION = 1
@@ -33,16 +33,16 @@ class Demonstrations(NamedTuple):
     """
 
     transition: Transition
-    truncated: chex.Array
-    episode: chex.Array
+    truncated: Array
+    episode: Array
     metadata: dict[str, Any]
 
 
 class DemonstrationSubset(NamedTuple):
     """`n` episodes of a pool: `start` `[n]` and `length` `[n]`, both int32. Length 0 is padding."""
 
-    start: chex.Array
-    length: chex.Array
+    start: Array
+    length: Array
 
 
 def episodes(demonstrations: Demonstrations) -> DemonstrationSubset:
@@ -61,9 +61,9 @@ def returns(demonstrations: Demonstrations) -> np.ndarray:
 
 
 def subset(
-    key: chex.PRNGKey,
+    key: jax.Array,
     pool: DemonstrationSubset,
-    n: chex.Numeric,
+    n: Numeric,
     size: int | None = None,
 ) -> DemonstrationSubset:
     """Draw `n` different episodes of a pool, uniformly.
@@ -88,7 +88,7 @@ def subset(
     return DemonstrationSubset(jnp.asarray(pool.start)[chosen], length)
 
 
-def sample_index(key: chex.PRNGKey, subset: DemonstrationSubset, batch_size: int) -> chex.Array:
+def sample_index(key: jax.Array, subset: DemonstrationSubset, batch_size: int) -> jax.Array:
     """Steps of the pool, `[batch_size]` int32, uniform over all steps of the subset's episodes."""
     ends = jnp.cumsum(subset.length)
     step = jax.random.randint(key, (batch_size,), 0, ends[-1])
@@ -98,7 +98,7 @@ def sample_index(key: chex.PRNGKey, subset: DemonstrationSubset, batch_size: int
 
 
 def sample(
-    key: chex.PRNGKey, pool: Transition, subset: DemonstrationSubset, batch_size: int
+    key: jax.Array, pool: Transition, subset: DemonstrationSubset, batch_size: int
 ) -> Transition:
     """A minibatch `[batch_size, ...]` of a subset's steps, uniform with replacement.
 
@@ -186,6 +186,7 @@ def save(path: str | Path, demonstrations: Demonstrations) -> None:
         with partial.open("wb") as file:
             np.savez_compressed(
                 file,
+                allow_pickle=False,
                 header=np.array(json.dumps(header, sort_keys=True)),
                 truncated=np.asarray(demonstrations.truncated),
                 episode=np.asarray(demonstrations.episode),
@@ -211,7 +212,14 @@ def load(path: str | Path, spec: EnvSpec | None = None) -> Demonstrations:
             arrays = {name: file[name] for name in names}
     except (FileNotFoundError, IsADirectoryError, PermissionError):
         raise
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.zlib.error) as error:  # type: ignore[attr-defined]
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        EOFError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         raise ValueError(f"{path}: not a readable demonstrations file ({error})") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ValueError(f"{path}: not a demonstrations file of this library")

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 
@@ -19,9 +18,9 @@ class Rollouts(NamedTuple):
         terminated: `[B]` bool; for a goal-reaching task, whether the goal was reached.
     """
 
-    episode_return: chex.Array
-    length: chex.Array
-    terminated: chex.Array
+    episode_return: jax.Array
+    length: jax.Array
+    terminated: jax.Array
 
 
 class Evaluation(NamedTuple):
@@ -34,18 +33,18 @@ class Evaluation(NamedTuple):
         length_mean: mean episode length.
     """
 
-    return_mean: chex.Array
-    return_std: chex.Array
-    goal_fraction: chex.Array
-    length_mean: chex.Array
+    return_mean: jax.Array
+    return_std: jax.Array
+    goal_fraction: jax.Array
+    length_mean: jax.Array
 
 
 def rollout(
-    policy: Callable[[chex.Array], chex.Array],
+    policy: Callable[[jax.Array], jax.Array],
     env: Env,
     params: Any,
-    starts: tuple[Any, chex.Array],
-    key: chex.PRNGKey | None = None,
+    starts: tuple[Any, jax.Array],
+    key: jax.Array | None = None,
 ) -> Rollouts:
     """Run `B` episodes side by side to their ends; stops as soon as the last one has ended.
 
@@ -60,7 +59,7 @@ def rollout(
     count = observations.shape[0]
     key = jax.random.key(0) if key is None else key
 
-    def running(carry) -> chex.Array:
+    def running(carry) -> jax.Array:
         return ~jnp.all(carry[2])
 
     def advance(carry):
@@ -93,7 +92,7 @@ def summarise(rollouts: Rollouts) -> Evaluation:
 
 
 def evaluate(
-    policy: Callable[[chex.Array], chex.Array], env: Env, params: Any, starts: int
+    policy: Callable[[jax.Array], jax.Array], env: Env, params: Any, starts: int
 ) -> Evaluation:
     """Evaluate `policy` on `starts` start states, evenly spread and the same at every call."""
     return summarise(rollout(policy, env, params, env.starts(starts, params)))

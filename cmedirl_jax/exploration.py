@@ -10,20 +10,19 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
-import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax.types import EnvSpec
+from cmedirl_jax.types import EnvSpec, Numeric
 
 
 class PerturbFn(Protocol):
     """Turn a greedy action into the behaviour policy's."""
 
     def __call__(
-        self, state: Any, action: chex.Array, noise: Any, step: chex.Numeric
-    ) -> tuple[chex.Array, chex.Array, Any]:
+        self, state: Any, action: jax.Array, noise: Any, step: Numeric
+    ) -> tuple[jax.Array, jax.Array, Any]:
         """Return `(action [A], log_density [], state)`; `step` counts environment steps."""
         ...
 
@@ -40,23 +39,21 @@ class Exploration(NamedTuple):
         perturb: see `PerturbFn`; `sample` is `perturb` of `draw`.
     """
 
-    init: Callable[[chex.PRNGKey], Any]
+    init: Callable[[jax.Array], Any]
     reset: Callable[[Any], Any]
-    sample: Callable[..., tuple[chex.Array, chex.Array, Any]]
-    draw: Callable[[chex.PRNGKey], Any]
+    sample: Callable[..., tuple[jax.Array, jax.Array, Any]]
+    draw: Callable[[jax.Array], Any]
     perturb: PerturbFn
 
 
-@flax.struct.dataclass
-class GaussianHParams:
+class GaussianHParams(flax.struct.PyTreeNode):
     """Independent Gaussian noise."""
 
     scale: float = 0.5
     """Standard deviation, in half-widths of the action range."""
 
 
-@flax.struct.dataclass
-class OrnsteinUhlenbeckHParams:
+class OrnsteinUhlenbeckHParams(flax.struct.PyTreeNode):
     """Ornstein-Uhlenbeck noise (Lillicrap et al. 2015), reset at each episode."""
 
     theta: float = 0.15
@@ -65,8 +62,7 @@ class OrnsteinUhlenbeckHParams:
     """Standard deviation of the innovation, in half-widths of the action range."""
 
 
-@flax.struct.dataclass
-class EpsilonGreedyHParams:
+class EpsilonGreedyHParams(flax.struct.PyTreeNode):
     """Epsilon-greedy with a linear schedule (the paper, section 4.1)."""
 
     epsilon_start: float = 1.0
@@ -79,20 +75,18 @@ class EpsilonGreedyHParams:
     """Steps for which a random action is held (1: the paper's letter)."""
 
 
-@flax.struct.dataclass
-class OrnsteinUhlenbeckState:
+class OrnsteinUhlenbeckState(flax.struct.PyTreeNode):
     """`value` `[A]`, the noise last added, and the hyperparameters."""
 
-    value: chex.Array
+    value: jax.Array
     hparams: OrnsteinUhlenbeckHParams
 
 
-@flax.struct.dataclass
-class HeldActionState:
+class HeldActionState(flax.struct.PyTreeNode):
     """`action` `[A]` is held for `remaining` more steps."""
 
-    action: chex.Array
-    remaining: chex.Array
+    action: jax.Array
+    remaining: jax.Array
     hparams: EpsilonGreedyHParams
 
 
@@ -100,7 +94,7 @@ def gaussian(spec: EnvSpec, hparams: GaussianHParams | None = None) -> Explorati
     """clip(mu(s) + sigma eps) with eps ~ N(0, I); its state is its hyperparameters."""
     hparams = hparams or GaussianHParams()
 
-    def perturb(state: GaussianHParams, action: chex.Array, noise: chex.Array, step: chex.Numeric):
+    def perturb(state: GaussianHParams, action: jax.Array, noise: jax.Array, step: Numeric):
         del step
         scale = state.scale * _half_width(spec)
         action, log_density = _clipped_normal(spec, action, scale, noise)
@@ -123,13 +117,11 @@ def ornstein_uhlenbeck(
     """
     hparams = hparams or OrnsteinUhlenbeckHParams()
 
-    def init(key: chex.PRNGKey) -> OrnsteinUhlenbeckState:
+    def init(key: jax.Array) -> OrnsteinUhlenbeckState:
         del key
         return OrnsteinUhlenbeckState(jnp.zeros(spec.action_dim), hparams)
 
-    def perturb(
-        state: OrnsteinUhlenbeckState, action: chex.Array, noise: chex.Array, step: chex.Numeric
-    ):
+    def perturb(state: OrnsteinUhlenbeckState, action: jax.Array, noise: jax.Array, step: Numeric):
         del step
         mean = (1.0 - state.hparams.theta) * state.value
         scale = state.hparams.sigma * _half_width(spec)
@@ -153,11 +145,11 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
     hparams = hparams or EpsilonGreedyHParams()
     log_volume = float(jnp.sum(jnp.log(2.0 * _half_width(spec))))
 
-    def init(key: chex.PRNGKey) -> HeldActionState:
+    def init(key: jax.Array) -> HeldActionState:
         del key
         return HeldActionState(jnp.zeros(spec.action_dim), jnp.zeros(()), hparams)
 
-    def draw(key: chex.PRNGKey) -> tuple[chex.Array, chex.Array]:
+    def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         choice_key, action_key = jax.random.split(key)
         random_action = jax.random.uniform(
             action_key, (spec.action_dim,), minval=spec.action_low, maxval=spec.action_high
@@ -166,9 +158,9 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
 
     def perturb(
         state: HeldActionState,
-        action: chex.Array,
-        noise: tuple[chex.Array, chex.Array],
-        step: chex.Numeric,
+        action: jax.Array,
+        noise: tuple[jax.Array, jax.Array],
+        step: Numeric,
     ):
         choice, random_action = noise
         epsilon = _epsilon(state.hparams, step)
@@ -192,18 +184,18 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
     )
 
 
-def _epsilon(hparams: EpsilonGreedyHParams, step: chex.Numeric) -> chex.Array:
+def _epsilon(hparams: EpsilonGreedyHParams, step: Numeric) -> jax.Array:
     progress = jnp.clip(step / hparams.epsilon_steps, 0.0, 1.0)
     return hparams.epsilon_start + progress * (hparams.epsilon_end - hparams.epsilon_start)
 
 
-def _half_width(spec: EnvSpec) -> chex.Array:
+def _half_width(spec: EnvSpec) -> jax.Array:
     return 0.5 * jnp.asarray(spec.action_high - spec.action_low)
 
 
 def _clipped_normal(
-    spec: EnvSpec, mean: chex.Array, scale: chex.Array, noise: chex.Array
-) -> tuple[chex.Array, chex.Array]:
+    spec: EnvSpec, mean: jax.Array, scale: jax.Array, noise: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """clip(mean + scale * noise) `[A]` and its log density `[]`, tail masses at the bounds."""
     low, high = jnp.asarray(spec.action_low), jnp.asarray(spec.action_high)
     action = jnp.clip(mean + scale * noise, low, high)
@@ -215,12 +207,12 @@ def _clipped_normal(
 
 
 def _exploration(
-    init: Callable[[chex.PRNGKey], Any],
+    init: Callable[[jax.Array], Any],
     reset: Callable[[Any], Any],
-    draw: Callable[[chex.PRNGKey], Any],
+    draw: Callable[[jax.Array], Any],
     perturb: PerturbFn,
 ) -> Exploration:
-    def sample(key: chex.PRNGKey, state: Any, action: chex.Array, step: chex.Numeric):
+    def sample(key: jax.Array, state: Any, action: jax.Array, step: Numeric):
         return perturb(state, action, draw(key), step)
 
     return Exploration(init, reset, sample, draw, perturb)

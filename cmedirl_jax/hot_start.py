@@ -12,9 +12,8 @@ as it stands; the three readings are the values of `HotStartHParams.critic`:
   return that the demonstration went on to receive: values on the scale of returns
 """
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -25,11 +24,10 @@ from cmedirl_jax import demonstrations as demonstrations_lib
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.demonstrations import Demonstrations, DemonstrationSubset
 from cmedirl_jax.networks import ActorCritic
-from cmedirl_jax.types import EnvSpec, Params, Transition
+from cmedirl_jax.types import Array, EnvSpec, Params, Transition
 
 
-@flax.struct.dataclass
-class HotStartHParams:
+class HotStartHParams(flax.struct.PyTreeNode):
     """Hyperparameters; the strings and sizes are static."""
 
     learning_rate: float = 1e-3
@@ -60,7 +58,7 @@ class HotStartData(NamedTuple):
     """
 
     transition: Transition
-    discounted_return: chex.Array
+    discounted_return: Array
     episodes: DemonstrationSubset
 
 
@@ -74,7 +72,7 @@ def data(demonstrations: Demonstrations, discount: float) -> HotStartData:
 
 
 def fit(
-    key: chex.PRNGKey,
+    key: jax.Array,
     networks: ActorCritic,
     params: tuple[Params, Params],
     demonstrations: Demonstrations | HotStartData,
@@ -101,10 +99,10 @@ def fit(
     if isinstance(demonstrations, Demonstrations):
         demonstrations = data(demonstrations, hparams.discount)
     pool = jax.tree.map(jnp.asarray, demonstrations)
-    subset = subset if subset is not None else pool.episodes
+    chosen = pool.episodes if subset is None else subset
     optimizer = optax.adam(hparams.learning_rate)
 
-    def loss(params: tuple[Params, Params], index: chex.Array):
+    def loss(params: tuple[Params, Params], index: jax.Array):
         actor, critic = params
         observation = pool.transition.observation[index]
         action = pool.transition.action[index]
@@ -115,22 +113,21 @@ def fit(
         # Disjoint parameters: the gradient of the sum is each network's own.
         return actor_error + critic_error, (actor, critic)
 
-    def step(carry, key):
+    def step(carry: tuple[Any, optax.OptState], key: jax.Array):
         params, state = carry
-        index = demonstrations_lib.sample_index(key, subset, hparams.batch_size)
+        index = demonstrations_lib.sample_index(key, chosen, hparams.batch_size)
         grads, params = jax.grad(loss, has_aux=True)(params, index)
         updates, state = optimizer.update(grads, state, params)
         return (optax.apply_updates(params, updates), state), None
 
-    (params, _), _ = jax.lax.scan(
-        step, (params, optimizer.init(params)), jax.random.split(key, hparams.steps)
-    )
-    return params
+    carry = (params, optimizer.init(params))
+    (fitted, _), _ = jax.lax.scan(step, carry, jax.random.split(key, hparams.steps))
+    return fitted
 
 
 def actor_loss(
-    networks: ActorCritic, actor: Params, observation: chex.Array, action: chex.Array
-) -> tuple[chex.Array, Params]:
+    networks: ActorCritic, actor: Params, observation: jax.Array, action: jax.Array
+) -> tuple[jax.Array, Params]:
     """Mean squared error of mu(s) to the demonstrated action: `[B, O]`, `[B, A]` -> `[]`."""
     pre_activation, actor = networks_lib.train_mode(networks.actor)(actor, observation)
     return jnp.mean(jnp.square(networks.squash(pre_activation) - action)), actor
@@ -140,10 +137,10 @@ def critic_loss(
     networks: ActorCritic,
     critic: Params,
     hparams: HotStartHParams,
-    observation: chex.Array,
-    action: chex.Array,
-    discounted_return: chex.Array,
-) -> tuple[chex.Array, Params]:
+    observation: jax.Array,
+    action: jax.Array,
+    discounted_return: jax.Array,
+) -> tuple[jax.Array, Params]:
     """Eq. 11 in the reading that `hparams.critic` names, averaged over the batch, and the params.
 
     Args:

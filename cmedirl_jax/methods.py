@@ -136,9 +136,7 @@ def compose(spec: EnvSpec, method: Method, settings: Settings, capacity: int) ->
         spec, settings.reward, network=rewards.mlp(spec, settings.reward_schedule.hidden)
     )
     return Algorithm(
-        agent=ddpg.make(
-            spec, settings.agent, networks=networks.make(spec, settings.architecture)
-        ),
+        agent=ddpg.make(spec, settings.agent, networks=networks.make(spec, settings.architecture)),
         learner=learner if method.learned_reward else None,
         exploration=make_exploration(spec, settings.exploration),
         replay=replay.make(spec, settings.schedule.replay_capacity or capacity),

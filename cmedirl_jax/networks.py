@@ -8,9 +8,8 @@ small uniform range for the last layer.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -34,7 +33,7 @@ class ActorCritic(NamedTuple):
 
     actor: Network
     critic: Network
-    squash: Callable[[chex.Array], chex.Array]
+    squash: Callable[[jax.Array], jax.Array]
     spec: EnvSpec
 
 
@@ -74,7 +73,7 @@ class MLP(nn.Module):
     output_scale: float = 3e-3
 
     @nn.compact
-    def __call__(self, x: chex.Array, joined: chex.Array | None = None, train: bool = False):
+    def __call__(self, x: jax.Array, joined: jax.Array | None = None, train: bool = False):
         """Return `[..., output_dim]` for `x` of `[..., D]` and `joined` of `[..., E]` or None."""
         for index, units in enumerate(self.hidden):
             if joined is not None and index == self.join:
@@ -135,14 +134,14 @@ def make(spec: EnvSpec, architecture: Architecture | None = None) -> ActorCritic
     return ActorCritic(actor(spec, architecture), critic(spec, architecture), squashing(spec), spec)
 
 
-def squashing(spec: EnvSpec) -> Callable[[chex.Array], chex.Array]:
+def squashing(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
     """Tanh onto the action bounds: `[..., A]` -> `[..., A]`."""
-    centre = 0.5 * (spec.action_high + spec.action_low)
-    half_width = 0.5 * (spec.action_high - spec.action_low)
+    centre = jnp.asarray(0.5 * (spec.action_high + spec.action_low))
+    half_width = jnp.asarray(0.5 * (spec.action_high - spec.action_low))
     return lambda pre_activation: centre + half_width * jnp.tanh(pre_activation)
 
 
-def observation_scaling(spec: EnvSpec) -> Callable[[chex.Array], chex.Array]:
+def observation_scaling(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
     """The affine map from `spec`'s observation bounds to [-1, 1]: `[..., O]` -> `[..., O]`.
 
     Raises:
@@ -158,9 +157,7 @@ def observation_scaling(spec: EnvSpec) -> Callable[[chex.Array], chex.Array]:
     return lambda observation: (observation - centre) / half_width
 
 
-def from_module(
-    apply: Callable[..., chex.Array], init: Callable[[chex.PRNGKey], Params]
-) -> Network:
+def from_module(apply: Callable[..., Any], init: Callable[[jax.Array], Params]) -> Network:
     """Wrap a Linen `apply` (taking `train=` and `mutable=`) and `init` as a `Network`.
 
     The network gets a `train` function where its variables hold a `batch_stats` collection.
@@ -169,9 +166,9 @@ def from_module(
     if not has_statistics:
         return Network(init, apply)
 
-    def train(variables: Params, *inputs: chex.Array) -> tuple[chex.Array, Params]:
-        output, moved = apply(variables, *inputs, train=True, mutable=["batch_stats"])  # type: ignore[misc]
-        return output, {**variables, **moved}  # type: ignore[dict-item]
+    def train(variables: Params, *inputs: jax.Array) -> tuple[jax.Array, Params]:
+        output, moved = apply(variables, *inputs, train=True, mutable=["batch_stats"])
+        return output, {**variables, **moved}
 
     return Network(init, apply, train)
 
@@ -179,21 +176,21 @@ def from_module(
 def scalar_output(network: Network) -> Network:
     """Drop the last axis, of size one, of a network's output."""
 
-    def apply(params: Params, *inputs: chex.Array) -> chex.Array:
+    def apply(params: Params, *inputs: jax.Array) -> jax.Array:
         return network.apply(params, *inputs)[..., 0]
 
     if network.train is None:
         return Network(network.init, apply)
     network_train = network.train
 
-    def train(params: Params, *inputs: chex.Array) -> tuple[chex.Array, Params]:
+    def train(params: Params, *inputs: jax.Array) -> tuple[jax.Array, Params]:
         output, params = network_train(params, *inputs)
         return output[..., 0], params
 
     return Network(network.init, apply, train)
 
 
-def train_mode(network: Network) -> Callable[..., tuple[chex.Array, Params]]:
+def train_mode(network: Network) -> Callable[..., tuple[jax.Array, Params]]:
     """`network.train`, or for a network without statistics its `apply` and unchanged parameters."""
     if network.train is not None:
         return network.train
@@ -203,11 +200,11 @@ def train_mode(network: Network) -> Callable[..., tuple[chex.Array, Params]]:
 def _dense(units: int, bound: float) -> nn.Dense:
     """A dense layer whose kernel and bias are drawn from U(-bound, bound)."""
 
-    def uniform(key: chex.PRNGKey, shape: tuple[int, ...], dtype=jnp.float32) -> chex.Array:
+    def uniform(key: jax.Array, shape: tuple[int, ...], dtype=jnp.float32) -> jax.Array:
         return jax.random.uniform(key, shape, dtype, -bound, bound)
 
     return nn.Dense(units, kernel_init=uniform, bias_init=uniform)
 
 
-def _identity(observation: chex.Array) -> chex.Array:
+def _identity(observation: jax.Array) -> jax.Array:
     return observation

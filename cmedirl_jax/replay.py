@@ -8,7 +8,6 @@ buffers in step may carry that number once, unbatched (`training` does).
 from collections.abc import Callable
 from typing import NamedTuple
 
-import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -16,15 +15,14 @@ import jax.numpy as jnp
 from cmedirl_jax.types import EnvSpec, Transition
 
 
-@flax.struct.dataclass
-class ReplayState:
+class ReplayState(flax.struct.PyTreeNode):
     """The buffer: `storage` `[capacity, D]` float32 and `count` `[]` int32, transitions ever added.
 
     Row `count % capacity` is written next; `min(count, capacity)` rows are filled.
     """
 
-    storage: chex.Array
-    count: chex.Array
+    storage: jax.Array
+    count: jax.Array
 
 
 class Replay(NamedTuple):
@@ -33,7 +31,7 @@ class Replay(NamedTuple):
     Attributes:
         init: `() -> ReplayState`, empty.
         add: `(state, transition) -> ReplayState`; overwrites the oldest once full.
-        sample: `(key, state, batch_size, recent=None) -> Transition` with leaves `[batch_size, ...]`,
+        sample: `(key, state, batch_size, recent=None) -> Transition`, leaves `[batch_size, ...]`:
             uniform with replacement over what is there, or over its `recent` latest transitions.
             An empty buffer gives zeros.
         draw: `(key, batch_size) -> bits`, the randomness of `sample`, to draw ahead of time.
@@ -43,7 +41,7 @@ class Replay(NamedTuple):
     init: Callable[[], ReplayState]
     add: Callable[[ReplayState, Transition], ReplayState]
     sample: Callable[..., Transition]
-    draw: Callable[[chex.PRNGKey, int], chex.Array]
+    draw: Callable[[jax.Array, int], jax.Array]
     take: Callable[..., Transition]
 
 
@@ -64,10 +62,10 @@ def make(spec: EnvSpec, capacity: int) -> Replay:
         position = state.count % capacity
         return ReplayState(state.storage.at[position].set(row), state.count + 1)
 
-    def draw(key: chex.PRNGKey, batch_size: int) -> chex.Array:
+    def draw(key: jax.Array, batch_size: int) -> jax.Array:
         return jax.random.bits(key, (batch_size,), jnp.uint32)
 
-    def take(state: ReplayState, bits: chex.Array, recent: int | None = None) -> Transition:
+    def take(state: ReplayState, bits: jax.Array, recent: int | None = None) -> Transition:
         size = jnp.minimum(state.count, capacity if recent is None else min(recent, capacity))
         # The bias of a remainder is below size / 2^32: nothing beside sampling noise.
         age = (bits % jnp.maximum(size, 1).astype(jnp.uint32)).astype(jnp.int32)
@@ -75,7 +73,7 @@ def make(spec: EnvSpec, capacity: int) -> Replay:
         return unpack(spec, state.storage[index])
 
     def sample(
-        key: chex.PRNGKey, state: ReplayState, batch_size: int, recent: int | None = None
+        key: jax.Array, state: ReplayState, batch_size: int, recent: int | None = None
     ) -> Transition:
         return take(state, draw(key, batch_size), recent)
 
@@ -87,7 +85,7 @@ def row_size(spec: EnvSpec) -> int:
     return 2 * spec.observation_dim + spec.action_dim + 2
 
 
-def pack(spec: EnvSpec, transition: Transition) -> chex.Array:
+def pack(spec: EnvSpec, transition: Transition) -> jax.Array:
     """A transition's leaves as rows `[..., D]` float32.
 
     Raises:
@@ -113,7 +111,7 @@ def pack(spec: EnvSpec, transition: Transition) -> chex.Array:
     )
 
 
-def unpack(spec: EnvSpec, rows: chex.Array) -> Transition:
+def unpack(spec: EnvSpec, rows: jax.Array) -> Transition:
     """The transition in rows `[..., D]`: the inverse of `pack`."""
     o, a = spec.observation_dim, spec.action_dim
     return Transition(

@@ -11,9 +11,7 @@ def mlp(spec: EnvSpec, hidden: tuple[int, ...] = (64, 64)) -> Network:
 
     The critic's shape without its normalisation: both inputs scaled to [-1, 1] and joined.
     """
-    return networks.critic(
-        spec, networks.Architecture(hidden=hidden, critic_normalisation="none")
-    )
+    return networks.critic(spec, networks.Architecture(hidden=hidden, critic_normalisation="none"))
 
 
 def bounded(output, bound):

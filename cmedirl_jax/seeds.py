@@ -5,9 +5,8 @@ few seeds, each run through its whole chunk of steps before the next begins, sta
 """
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
-import chex
 import jax
 import numpy as np
 
@@ -17,7 +16,7 @@ GROUP_SIZES = range(4, 11)
 """Seeds per group that were measured to fit a core's cache at a width of 64."""
 
 
-def keys(key: chex.PRNGKey, count: int) -> chex.Array:
+def keys(key: jax.Array, count: int) -> jax.Array:
     """`[count]` keys; seed i's is `fold_in(key, i)`, whatever the count."""
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, np.arange(count))
 
@@ -62,9 +61,7 @@ def map_groups(function: Callable[..., State], group: int) -> Callable[..., Stat
     return mapped
 
 
-def map_devices(
-    function: Callable[..., State], devices: Sequence[jax.Device]
-) -> Callable[..., State]:
+def map_devices(function: Callable[..., State], devices: Sequence[Any]) -> Callable[..., State]:
     """Split the leading axis of the first argument over `devices`; share the other arguments.
 
     Args:

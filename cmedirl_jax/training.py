@@ -11,7 +11,6 @@ neither on how many seeds run beside it nor on how its steps are cut into chunks
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -27,11 +26,10 @@ from cmedirl_jax.hot_start import HotStartData
 from cmedirl_jax.irl import RewardState
 from cmedirl_jax.methods import Algorithm, Method, Settings
 from cmedirl_jax.replay import ReplayState
-from cmedirl_jax.types import Transition
+from cmedirl_jax.types import Numeric, Transition
 
 
-@flax.struct.dataclass
-class TrainingState:
+class TrainingState(flax.struct.PyTreeNode):
     """One seed.
 
     Attributes:
@@ -48,16 +46,16 @@ class TrainingState:
         subset: the seed's own demonstrations, or None.
     """
 
-    key: chex.PRNGKey
+    key: jax.Array
     agent: DDPGState
     reward: RewardState | None
-    storage: chex.Array
+    storage: jax.Array
     exploration: Any
     env: Any
-    observation: chex.Array
-    episode: chex.Array
-    episode_return: chex.Array
-    episode_length: chex.Array
+    observation: jax.Array
+    episode: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
     subset: DemonstrationSubset | None
 
 
@@ -74,13 +72,13 @@ class Log(NamedTuple):
         q_mean: of that update, else 0.
     """
 
-    done: chex.Array
-    terminated: chex.Array
-    episode_return: chex.Array
-    episode_length: chex.Array
-    learned: chex.Array
-    critic_loss: chex.Array
-    q_mean: chex.Array
+    done: jax.Array
+    terminated: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+    learned: jax.Array
+    critic_loss: jax.Array
+    q_mean: jax.Array
 
 
 class Trainer(NamedTuple):
@@ -100,29 +98,29 @@ class Trainer(NamedTuple):
     algorithm: Algorithm
     init: Callable[..., TrainingState]
     run: Callable[..., tuple[TrainingState, Log]]
-    act: Callable[..., chex.Array]
+    act: Callable[..., jax.Array]
 
 
 class _Draws(NamedTuple):
     """All randomness of a step."""
 
-    env: chex.PRNGKey
-    reset: chex.PRNGKey
+    env: jax.Array
+    reset: jax.Array
     noise: Any
-    batch: chex.Array
-    background: chex.Array
-    demonstrations: chex.Array
+    batch: jax.Array
+    background: jax.Array
+    demonstrations: jax.Array
 
 
 class _Schedule(NamedTuple):
     """What a step does, the same for every seed."""
 
-    step: chex.Array
-    learn: chex.Array
-    update_targets: chex.Array
-    learn_reward: chex.Array
-    reward_weight: chex.Array
-    cloning_weight: chex.Array
+    step: jax.Array
+    learn: jax.Array
+    update_targets: jax.Array
+    learn_reward: jax.Array
+    reward_weight: jax.Array
+    cloning_weight: jax.Array
 
 
 def make(
@@ -153,9 +151,7 @@ def make(
     clones = method.hot_start and settings.agent.behaviour_cloning > 0
     stores_shaped = learner is not None and reward_schedule.storage == "store"
 
-    def init(
-        key: chex.PRNGKey, data: HotStartData | None, n_demonstrations: chex.Numeric
-    ) -> TrainingState:
+    def init(key: jax.Array, data: HotStartData | None, n_demonstrations: Numeric) -> TrainingState:
         agent_key, fit_key, reward_key, env_key, noise_key, subset_key = jax.random.split(key, 6)
         state = agent.init(agent_key)
         subset = None
@@ -190,7 +186,7 @@ def make(
             subset=subset,
         )
 
-    def draw(key: chex.PRNGKey, subset: DemonstrationSubset | None, step: chex.Array) -> _Draws:
+    def draw(key: jax.Array, subset: DemonstrationSubset | None, step: jax.Array) -> _Draws:
         keys = jax.random.split(jax.random.fold_in(key, step), 6)
         empty = jnp.zeros((0,), jnp.uint32)
         reward_batch = reward_schedule.iterations * reward_schedule.batch_size
@@ -206,7 +202,7 @@ def make(
             else empty,
         )
 
-    def plan(step: chex.Array) -> _Schedule:
+    def plan(step: jax.Array) -> _Schedule:
         learn = step >= schedule.learning_starts
         learn_reward = learn & (step % reward_schedule.period == 0)
         if reward_schedule.stop is not None:
@@ -223,8 +219,8 @@ def make(
             cloning_weight=jnp.maximum(1.0 - step / schedule.behaviour_cloning_steps, 0.0),
         )
 
-    def shaped(reward_state: RewardState | None, batch: Transition, weight: chex.Array):
-        if learner is None:
+    def shaped(reward_state: RewardState | None, batch: Transition, weight: jax.Array):
+        if learner is None or reward_state is None:
             return batch
         r_d = learner.reward(reward_state, batch.observation, batch.action)
         return batch._replace(reward=shaping.additive(batch.reward, r_d, weight))
@@ -261,7 +257,9 @@ def make(
         hparams = agent_state.hparams
         weight = hparams.behaviour_cloning
         agent_state, info = agent.update(
-            agent_state.replace(hparams=hparams.replace(behaviour_cloning=weight * now.cloning_weight)),
+            agent_state.replace(
+                hparams=hparams.replace(behaviour_cloning=weight * now.cloning_weight)
+            ),
             batch,
             _rows(pool, draws.demonstrations[: schedule.batch_size]),
             update_targets=now.update_targets,
@@ -273,7 +271,7 @@ def make(
         pool: Transition | None,
         draws: _Draws,
         now: _Schedule,
-        max_episodes: chex.Array | None,
+        max_episodes: jax.Array | None,
     ) -> tuple[TrainingState, Log]:
         greedy = agent.act(state.agent, state.observation)
         action, _, exploration_state = exploration.perturb(
@@ -333,8 +331,8 @@ def make(
     def run(
         state: TrainingState,
         data: HotStartData | None,
-        steps: chex.Array,
-        max_episodes: chex.Numeric | None = None,
+        steps: jax.Array,
+        max_episodes: Numeric | None = None,
     ) -> tuple[TrainingState, Log]:
         pool = None if data is None else data.transition
         # Hashing a chunk's randomness in one go costs a tenth of hashing it step by step.
@@ -345,7 +343,7 @@ def make(
 
         return jax.lax.scan(body, state, (draws, jax.vmap(plan)(steps)))
 
-    def act(params: Any, observation: chex.Array) -> chex.Array:
+    def act(params: Any, observation: jax.Array) -> jax.Array:
         networks = agent.networks
         return networks.squash(networks.actor.apply(params, observation))
 
@@ -367,7 +365,7 @@ class Result(NamedTuple):
 
 
 def fit(
-    key: chex.PRNGKey,
+    key: jax.Array,
     env: Env,
     method: Method | str,
     demonstrations: Demonstrations | None = None,
@@ -417,11 +415,11 @@ def fit(
             evaluation_starts,
         )
 
-    def learn(key: chex.PRNGKey) -> Result:
+    def learn(key: jax.Array) -> Result:
         state = trainer.init(key, data, n)
         first = evaluate(state)
 
-        def chunk(state: TrainingState, steps: chex.Array):
+        def chunk(state: TrainingState, steps: jax.Array):
             state, log = trainer.run(state, data, steps)
             return state, (evaluate(state), log)
 
@@ -440,15 +438,15 @@ def _with_metrics(agent_state: DDPGState, info):
     return agent_state, info.critic_loss, info.q_mean
 
 
-def _rows(pool: Any, index: chex.Array) -> Any:
+def _rows(pool: Any, index: jax.Array) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], pool)
 
 
-def _select(predicate: chex.Array, on_true: Any, on_false: Any) -> Any:
+def _select(predicate: jax.Array, on_true: Any, on_false: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(predicate, x, y), on_true, on_false)
 
 
-def _stop_learning(state: TrainingState, stopped: chex.Array) -> TrainingState:
+def _stop_learning(state: TrainingState, stopped: jax.Array) -> TrainingState:
     """Set a stopped seed's learning rates to zero: cheaper than a select over every parameter."""
     goes_on = 1.0 - stopped.astype(jnp.float32)
     hparams = state.agent.hparams

@@ -3,11 +3,17 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import chex
+import jax
 import numpy as np
 
-Params = chex.ArrayTree
+Params = Any
 """Parameters of a network: any pytree of arrays."""
+
+Array = jax.Array | np.ndarray
+"""An array on the device or on the host."""
+
+Numeric = jax.Array | float
+"""A scalar that may be traced: a Python number or an array of shape `[]`."""
 
 
 class EnvSpec(NamedTuple):
@@ -48,11 +54,11 @@ class Transition(NamedTuple):
         terminated: `[...]` bool; a time limit is not termination and still bootstraps.
     """
 
-    observation: chex.Array
-    action: chex.Array
-    reward: chex.Array
-    next_observation: chex.Array
-    terminated: chex.Array
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    next_observation: jax.Array
+    terminated: jax.Array
 
 
 class Network(NamedTuple):
@@ -66,6 +72,6 @@ class Network(NamedTuple):
             with the running ones moved. None for every other network.
     """
 
-    init: Callable[[chex.PRNGKey], Params]
+    init: Callable[[jax.Array], Params]
     apply: Callable[..., Any]
     train: Callable[..., tuple[Any, Params]] | None = None

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
-import chex
+import jax
 
 from cmedirl_jax.types import EnvSpec
 
@@ -18,16 +18,16 @@ class Step(NamedTuple):
         truncated: `[]` bool, the time limit was reached (bootstrapping goes on). Both may be set.
     """
 
-    observation: chex.Array
-    reward: chex.Array
-    terminated: chex.Array
-    truncated: chex.Array
+    observation: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
 
 
 class ResetFn(Protocol):
     """Start an episode."""
 
-    def __call__(self, key: chex.PRNGKey, params: Any) -> tuple[Any, chex.Array]:
+    def __call__(self, key: jax.Array, params: Any) -> tuple[Any, jax.Array]:
         """Return the first state and its observation `[O]`."""
         ...
 
@@ -36,7 +36,7 @@ class StepFn(Protocol):
     """Advance by one action. No auto-reset."""
 
     def __call__(
-        self, key: chex.PRNGKey, state: Any, action: chex.Array, params: Any
+        self, key: jax.Array, state: Any, action: jax.Array, params: Any
     ) -> tuple[Any, Step]:
         """Return the new state and its `Step`, for `action` `[A]`."""
         ...
@@ -58,4 +58,4 @@ class Env(NamedTuple):
     default_params: Any
     reset: ResetFn
     step: StepFn
-    starts: Callable[[int, Any], tuple[Any, chex.Array]]
+    starts: Callable[[int, Any], tuple[Any, jax.Array]]

@@ -6,41 +6,38 @@ given, and the velocity is zeroed at the left wall (not at the goal). Gymnasium 
 in double precision; this version is float32 throughout and agrees to 1e-7 per step.
 """
 
-import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax.envs.base import Env, Step
-from cmedirl_jax.types import EnvSpec
+from cmedirl_jax.types import EnvSpec, Numeric
 
 
-@flax.struct.dataclass
-class MountainCarParams:
+class MountainCarParams(flax.struct.PyTreeNode):
     """Physics, as traced leaves. Positions and velocities are in the units of Gymnasium's car."""
 
-    power: chex.Numeric = 0.0015
-    gravity: chex.Numeric = 0.0025
-    max_speed: chex.Numeric = 0.07
-    min_position: chex.Numeric = -1.2
-    max_position: chex.Numeric = 0.6
-    goal_position: chex.Numeric = 0.45
-    goal_velocity: chex.Numeric = 0.0
-    goal_reward: chex.Numeric = 100.0
-    action_cost: chex.Numeric = 0.1
-    start_low: chex.Numeric = -0.6
-    start_high: chex.Numeric = -0.4
-    max_episode_steps: chex.Numeric = 999
+    power: Numeric = 0.0015
+    gravity: Numeric = 0.0025
+    max_speed: Numeric = 0.07
+    min_position: Numeric = -1.2
+    max_position: Numeric = 0.6
+    goal_position: Numeric = 0.45
+    goal_velocity: Numeric = 0.0
+    goal_reward: Numeric = 100.0
+    action_cost: Numeric = 0.1
+    start_low: Numeric = -0.6
+    start_high: Numeric = -0.4
+    max_episode_steps: Numeric = 999
 
 
-@flax.struct.dataclass
-class MountainCarState:
+class MountainCarState(flax.struct.PyTreeNode):
     """The car. `time` counts the steps of the episode so far."""
 
-    position: chex.Array
-    velocity: chex.Array
-    time: chex.Array
+    position: jax.Array
+    velocity: jax.Array
+    time: jax.Array
 
 
 SPEC = EnvSpec(
@@ -61,21 +58,19 @@ def make() -> Env:
     return Env(SPEC, MountainCarParams(), reset, step, starts)
 
 
-def reset(
-    key: chex.PRNGKey, params: MountainCarParams
-) -> tuple[MountainCarState, chex.Array]:
+def reset(key: jax.Array, params: MountainCarParams) -> tuple[MountainCarState, jax.Array]:
     """Start at rest, at a position drawn from U(start_low, start_high)."""
     position = jax.random.uniform(key, minval=params.start_low, maxval=params.start_high)
     return _at_rest(position)
 
 
-def starts(count: int, params: MountainCarParams) -> tuple[MountainCarState, chex.Array]:
+def starts(count: int, params: MountainCarParams) -> tuple[MountainCarState, jax.Array]:
     """`count` start states at rest, evenly spaced over the start interval, its ends included."""
     return jax.vmap(_at_rest)(jnp.linspace(params.start_low, params.start_high, count))
 
 
 def step(
-    key: chex.PRNGKey, state: MountainCarState, action: chex.Array, params: MountainCarParams
+    key: jax.Array, state: MountainCarState, action: jax.Array, params: MountainCarParams
 ) -> tuple[MountainCarState, Step]:
     """Advance the car; deterministic, so `key` goes unused. `action` is `[1]`."""
     del key
@@ -93,10 +88,10 @@ def step(
     return new_state, Step(_observe(new_state), reward, terminated, truncated)
 
 
-def _at_rest(position: chex.Array) -> tuple[MountainCarState, chex.Array]:
+def _at_rest(position: jax.Array) -> tuple[MountainCarState, jax.Array]:
     state = MountainCarState(position, jnp.zeros_like(position), jnp.zeros((), jnp.int32))
     return state, _observe(state)
 
 
-def _observe(state: MountainCarState) -> chex.Array:
+def _observe(state: MountainCarState) -> jax.Array:
     return jnp.stack([state.position, state.velocity])

@@ -1,14 +1,13 @@
 """Algorithm 1: gradient steps on a reward network from demonstrations and background samples.
 
-    learner = irl.make(env.spec)
-    state = learner.init(jax.random.key(0))
-    state, info = jax.jit(learner.update)(state, demonstrations, background)
+learner = irl.make(env.spec)
+state = learner.init(jax.random.key(0))
+state, info = jax.jit(learner.update)(state, demonstrations, background)
 """
 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -19,8 +18,7 @@ from cmedirl_jax.irl import objectives
 from cmedirl_jax.types import EnvSpec, Network, Params, Transition
 
 
-@flax.struct.dataclass
-class IRLHParams:
+class IRLHParams(flax.struct.PyTreeNode):
     """Hyperparameters. The numbers are traced leaves of the state."""
 
     learning_rate: float = 1e-3
@@ -35,8 +33,7 @@ class IRLHParams:
     """Append the demonstration batch to the background batch (Algorithm 1, line 4)."""
 
 
-@flax.struct.dataclass
-class RewardState:
+class RewardState(flax.struct.PyTreeNode):
     """The reward network's parameters, its optimiser and the hyperparameters."""
 
     params: Params
@@ -54,10 +51,10 @@ class RewardInfo(NamedTuple):
         gradient_norm: global norm of dL/dtheta (Eq. 5), penalties included.
     """
 
-    demonstration_reward: chex.Array
-    background_reward: chex.Array
-    log_prior: chex.Array
-    gradient_norm: chex.Array
+    demonstration_reward: jax.Array
+    background_reward: jax.Array
+    log_prior: jax.Array
+    gradient_norm: jax.Array
 
 
 class UpdateFn(Protocol):
@@ -69,7 +66,7 @@ class UpdateFn(Protocol):
         demonstrations: Transition,
         background: Transition,
         *,
-        key: chex.PRNGKey | None = None,
+        key: jax.Array | None = None,
     ) -> tuple[RewardState, RewardInfo]:
         """Ascend L(theta) = log P(D | r_theta) + log P(theta).
 
@@ -94,8 +91,8 @@ class RewardLearner(NamedTuple):
         update: see `UpdateFn`.
     """
 
-    init: Callable[[chex.PRNGKey], RewardState]
-    reward: Callable[[RewardState, chex.Array, chex.Array], chex.Array]
+    init: Callable[[jax.Array], RewardState]
+    reward: Callable[[RewardState, jax.Array, jax.Array], jax.Array]
     update: UpdateFn
 
 
@@ -119,20 +116,22 @@ def make(
     network = network or rewards.mlp(spec)
     tx = optax.with_extra_args_support(optimizer or optimizers.adam())
 
-    def init(key: chex.PRNGKey) -> RewardState:
+    def init(key: jax.Array) -> RewardState:
         params = network.init(key)
         traced = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams)
         return RewardState(params, tx.init(params), traced)
 
-    def reward(state: RewardState, observation: chex.Array, action: chex.Array) -> chex.Array:
-        return rewards.bounded(network.apply(state.params, observation, action), state.hparams.bound)
+    def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
+        return rewards.bounded(
+            network.apply(state.params, observation, action), state.hparams.bound
+        )
 
     def update(
         state: RewardState,
         demonstrations: Transition,
         background: Transition,
         *,
-        key: chex.PRNGKey | None = None,
+        key: jax.Array | None = None,
     ) -> tuple[RewardState, RewardInfo]:
         del key
         _check_pairs(spec, demonstrations, "demonstrations")
@@ -152,7 +151,7 @@ def make(
             )
         )
         penalty = 2.0 * state.hparams.output_penalty * output / output.size
-        # Eqs. 5, 6 and 9, with the sign of a loss: the difference in visitation is the error signal.
+        # Eqs. 5, 6 and 9 with a loss's sign: the difference in visitation is the error signal.
         (likelihood_gradient,) = vjp(penalty - bound_vjp(difference)[0])
         gradient = jax.tree.map(
             lambda data, theta: data + state.hparams.prior_precision * theta,

@@ -1,12 +1,12 @@
 """The data term of the likelihood, as the gradient it has with respect to the rewards."""
 
-import chex
+import jax
 import jax.numpy as jnp
 
 
 def visitation_difference(
     demonstrations: int, background: int, *, append: bool
-) -> tuple[chex.Array, chex.Array]:
+) -> tuple[jax.Array, jax.Array]:
     """dL_D/dr = mu_D - E[mu] on the sampled state-action pairs (Eq. 6, Eq. 8).
 
     mu_D is the empirical distribution of the demonstration batch. E[mu] is estimated by that of the

@@ -1,0 +1,1 @@
+"""The paper's study, as a command: `python -m experiments.run_grid`."""

@@ -1,0 +1,168 @@
+"""Demonstrations as the paper makes them: DDPG experts trained on the true reward (section 4.1)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax import demonstrations
+from cmedirl_jax.demonstrations import Demonstrations
+from cmedirl_jax.envs import Env
+from cmedirl_jax.methods import METHODS, Settings
+from cmedirl_jax.types import Transition
+from experiments import cells, judging
+from experiments.cells import Budget, Progress
+from experiments.errors import UserError
+from experiments.presets import Expert, ExpertSettings
+
+EVALUATION_STARTS = 100
+"""Start states on which the experts are ranked."""
+
+
+def make_pool(
+    key: jax.Array,
+    env: Env,
+    options: ExpertSettings,
+    which: Expert,
+    devices: list[jax.Device],
+    report: Callable[[Progress], None],
+) -> Demonstrations:
+    """Train experts and record noise-free trajectories, from fresh random starts.
+
+    Args:
+        key: randomness of training and starts.
+        env: the environment.
+        options: how many experts, how long, how many trajectories.
+        which: who demonstrates, see `choose`.
+        devices: to train on.
+        report: called after each chunk of training.
+
+    Raises:
+        UserError: if no expert's final policy reaches the environment's threshold.
+    """
+    train_key, start_key = jax.random.split(key)
+    settings = Settings()
+    group = seeds.group_size(options.seeds, len(devices), max(settings.architecture.hidden))
+    judge = judging.make(env, settings.architecture, group, devices)
+    programs = cells.compile_method(
+        env,
+        METHODS["ddpg"],
+        settings,
+        judge,
+        group=group,
+        seeds_count=options.seeds,
+        devices=devices,
+        capacity=options.steps,
+        subset_size=None,
+    )
+    threshold = env.spec.reward_threshold
+    result = cells.train(
+        programs,
+        train_key,
+        None,
+        0,
+        seeds_count=options.seeds,
+        budget=Budget(options.steps, None, options.steps, EVALUATION_STARTS),
+        threshold=threshold,
+        report=report,
+    )
+    returns = result.evaluations[-1].evaluation.return_mean
+    chosen = choose(np.asarray(returns), which, threshold)
+    if not chosen.size:
+        raise UserError(
+            f"--experts: none of {options.seeds} experts reached a return of {threshold:g} in "
+            f"{options.steps} steps; give them more steps (--experts.steps) or seeds"
+        )
+    actors = jax.tree.map(lambda leaf: jnp.asarray(leaf[chosen]), result.final)
+    per_expert = -(-options.trajectories // chosen.size)
+    recorded = jax.jit(jax.vmap(lambda actor, key: record(judge.act, env, actor, key, per_expert)))(
+        actors, jax.random.split(start_key, chosen.size)
+    )
+    transition, running, truncated = jax.tree.map(np.asarray, recorded)
+    metadata = {
+        "env": env.spec.id,
+        "source": "noise-free trajectories of DDPG experts trained on the true reward",
+        "expert": which,
+        "experts_trained": options.seeds,
+        "experts_solved": int((returns >= threshold).sum()),
+        "experts_demonstrating": chosen.tolist(),
+        "expert_env_steps": int(result.env_steps.sum()),
+    }
+    return flatten(transition, running, truncated, metadata)
+
+
+def choose(returns: np.ndarray, which: Expert, threshold: float) -> np.ndarray:
+    """Which experts demonstrate, `[experts chosen]`; none if none solved the task.
+
+    Args:
+        returns: `[experts]`, of each one's final policy.
+        which: of those that solved the task the "best", the (lower) "median", or "all".
+        threshold: the return that counts as solved.
+    """
+    solved = np.flatnonzero(returns >= threshold)
+    ranked = solved[np.argsort(returns[solved], kind="stable")]
+    match which:
+        case "best":
+            return ranked[-1:]
+        case "median":
+            return ranked[(ranked.size - 1) // 2 :][:1]
+        case "all":
+            return solved
+
+
+def record(
+    act: Callable[[Any, jax.Array], jax.Array],
+    env: Env,
+    actor: Any,
+    key: jax.Array,
+    episodes: int,
+) -> tuple[Transition, jax.Array, jax.Array]:
+    """Record `episodes` noise-free episodes side by side from random starts.
+
+    Returns:
+        Transitions `[episodes, max_episode_steps, ...]`, whether the episode was still running at
+        that step, and whether the time limit cut it off there.
+    """
+    params = env.default_params
+    reset_key, step_key = jax.random.split(key)
+    states, observations = jax.vmap(env.reset, in_axes=(0, None))(
+        jax.random.split(reset_key, episodes), params
+    )
+
+    def advance(carry, time):
+        states, observations, running = carry
+        actions = act(actor, observations)
+        keys = jax.random.split(jax.random.fold_in(step_key, time), episodes)
+        states, step = jax.vmap(env.step, in_axes=(0, 0, 0, None))(keys, states, actions, params)
+        transition = Transition(
+            observations, actions, step.reward, step.observation, step.terminated
+        )
+        truncated = step.truncated & ~step.terminated
+        ended = step.terminated | step.truncated
+        return (states, step.observation, running & ~ended), (transition, running, truncated)
+
+    carry = (states, observations, jnp.ones(episodes, bool))
+    _, columns = jax.lax.scan(advance, carry, jnp.arange(env.spec.max_episode_steps))
+    return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), columns)
+
+
+def flatten(
+    transition: Transition, running: np.ndarray, truncated: np.ndarray, metadata: dict[str, Any]
+) -> Demonstrations:
+    """Lay recorded episodes `[..., episodes, time]` end to end and note their return."""
+    running = running.reshape(-1, running.shape[-1])
+
+    def keep(leaf: np.ndarray) -> np.ndarray:
+        return leaf.reshape(*running.shape, *leaf.shape[transition.reward.ndim :])[running]
+
+    pool = Demonstrations(
+        transition=jax.tree.map(keep, transition),
+        truncated=keep(truncated),
+        episode=np.repeat(np.arange(len(running), dtype=np.int32), running.sum(axis=1)),
+        metadata=metadata,
+    )
+    returns = demonstrations.returns(pool)
+    summary = {"return_mean": float(returns.mean()), "return_std": float(returns.std())}
+    return pool._replace(metadata={**metadata, **summary})

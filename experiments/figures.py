@@ -1,0 +1,157 @@
+"""The paper's Figures 3, 4 and 5, from the tables of a run."""
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import polars as pl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments import statistics
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#000000")
+LABELS = {"ddpg": "DDPG", "hs-ddpg": "HS-DDPG", "me-ddpg": "ME-DDPG", "hs-me-ddpg": "HS-ME-DDPG"}
+
+
+def draw(
+    folder: Path,
+    evaluations: pl.DataFrame,
+    episodes: pl.DataFrame,
+    summary: pl.DataFrame,
+    expert_return: float | None,
+    threshold: float,
+) -> list[Path]:
+    """Draw what the run's cells allow into `folder`, as PNG and SVG; returns the files."""
+    folder.mkdir(exist_ok=True)
+    n_demos = max(evaluations["n_demos"])
+    figures = {
+        "figure3": average_return(
+            evaluations.filter(pl.col("n_demos").is_in([0, n_demos])),
+            episodes.filter(pl.col("n_demos").is_in([0, n_demos])),
+            expert_return,
+            threshold,
+        )
+    }
+    if summary.filter(pl.col("n_demos") > 0)["n_demos"].n_unique() > 1:
+        figures["figure4"] = convergence(summary)
+        figures["figure5"] = return_after_convergence(summary, expert_return)
+    paths = []
+    for name, figure in figures.items():
+        for suffix in ("png", "svg"):
+            path = folder / f"{name}.{suffix}"
+            # No date and no random ids: drawing the same tables again gives the same file.
+            metadata = {"Date": None} if suffix == "svg" else {"Software": None}
+            with plt.rc_context({"svg.hashsalt": name}):
+                figure.savefig(path, dpi=150, metadata=metadata)
+            paths.append(path)
+        plt.close(figure)
+    return paths
+
+
+def average_return(
+    evaluations: pl.DataFrame, episodes: pl.DataFrame, expert: float | None, threshold: float
+) -> Figure:
+    """Figure 3: noise-free return over environment steps; behaviour return over episodes."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharey=True)
+    for colour, method in zip(COLOURS, _methods(evaluations), strict=False):
+        rows = evaluations.filter((pl.col("method") == method) & (pl.col("protocol") == "steps"))
+        _band(left, rows, "env_step", "return_mean", method, colour)
+        rows = episodes.filter(pl.col("method") == method)
+        if rows.height:
+            # Where the first seed runs out of episodes the seeds left are no longer the same ones.
+            last = rows.group_by("seed").agg(pl.col("episode").max())
+            seeds = evaluations.filter(pl.col("method") == method)["seed"].n_unique()
+            shortest = last["episode"].min() if last.height == seeds else 0
+            _band(
+                right,
+                rows.filter(pl.col("episode") <= shortest),
+                "episode",
+                "return",
+                method,
+                colour,
+            )
+    for axes in (left, right):
+        if expert is not None:
+            axes.axhline(expert, color="0.4", linestyle="--", linewidth=1, label="demonstrations")
+        axes.axhline(threshold, color="0.7", linestyle=":", linewidth=1, label="solved")
+    left.set(
+        title="Evaluation without exploration noise",
+        xlabel="environment steps",
+        ylabel="average return",
+    )
+    right.set(title="Training episodes, with exploration noise", xlabel="episodes")
+    left.legend(frameon=False, loc="lower right")
+    seeds = evaluations["seed"].n_unique()
+    n_demos = evaluations["n_demos"].max()
+    figure.suptitle(
+        f"Mean over {seeds} seeds and its 95% interval; {n_demos} demonstrations", fontsize=10
+    )
+    return figure
+
+
+def convergence(summary: pl.DataFrame) -> Figure:
+    """Figure 4: episodes and environment steps until convergence, over N_T."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    _over_demonstrations(left, summary, "convergence_episode_median")
+    left.set(ylabel="episodes until convergence (median)")
+    _over_demonstrations(right, summary, "convergence_env_step_median")
+    right.set(ylabel="environment steps until convergence (median)")
+    left.legend(frameon=False)
+    figure.suptitle("First evaluation at the reward threshold; 95% intervals", fontsize=10)
+    return figure
+
+
+def return_after_convergence(summary: pl.DataFrame, expert: float | None) -> Figure:
+    """Figure 5: mean return from convergence to the end of the run, over N_T."""
+    figure, axes = plt.subplots(figsize=(5.5, 4), layout="constrained")
+    _over_demonstrations(axes, summary, "return_after_convergence")
+    if expert is not None:
+        axes.axhline(expert, color="0.4", linestyle="--", linewidth=1, label="demonstrations")
+    axes.set(ylabel="average return after convergence")
+    axes.legend(frameon=False)
+    figure.suptitle("Mean over seeds and its 95% interval", fontsize=10)
+    return figure
+
+
+def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None:
+    numbers = sorted(set(summary.filter(pl.col("n_demos") > 0)["n_demos"]))
+    positions = np.arange(len(numbers))
+    methods = _methods(summary)
+    for index, (colour, method) in enumerate(zip(COLOURS, methods, strict=False)):
+        rows = summary.filter(pl.col("method") == method).sort("n_demos")
+        low, middle, high = (rows[column + end].to_numpy() for end in ("_low", "", "_high"))
+        label = LABELS.get(method, method)
+        if rows["n_demos"].max() == 0:
+            axes.axhline(middle[0], color=colour, label=label)
+            axes.axhspan(low[0], high[0], color=colour, alpha=0.15, linewidth=0)
+            continue
+        at = positions[np.isin(numbers, rows["n_demos"].to_numpy())]
+        offset = 0.06 * (index - (len(methods) - 1) / 2)
+        # A never-reached median has no finite bar: it is left out rather than drawn at a limit.
+        bars = np.nan_to_num([middle - low, high - middle])
+        axes.errorbar(at + offset, middle, bars, color=colour, marker="o", capsize=3, label=label)
+    axes.set_xticks(positions, [str(number) for number in numbers])
+    axes.set_xlabel("demonstrations $N_T$")
+
+
+def _band(axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, colour: str) -> None:
+    points = rows.group_by(x, maintain_order=True).agg(pl.col(y)).sort(x)
+    seeds = rows["seed"].n_unique()
+    points = points.filter(pl.col(y).list.len() == seeds)
+    intervals = np.array([statistics.mean(values.to_numpy()) for values in points[y]])
+    if not len(intervals):
+        return
+    axes.plot(points[x], intervals[:, 0], color=colour, label=LABELS.get(method, method))
+    axes.fill_between(
+        points[x], intervals[:, 1], intervals[:, 2], color=colour, alpha=0.2, linewidth=0
+    )
+
+
+def _methods(table: pl.DataFrame) -> list[str]:
+    return table["method"].unique(maintain_order=True).to_list()

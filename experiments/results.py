@@ -1,0 +1,147 @@
+"""The folder of a run: which cells are finished, its tables, its policies.
+
+A finished cell is one whose rows are in all tables; evaluations.parquet is written last, and every
+table is replaced whole, so a run that was cut off leaves only finished cells behind.
+"""
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import json
+import math
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from experiments.errors import UserError
+from experiments.presets import Grid
+
+SCHEMA = 1
+PACKAGES = ("jax", "jaxlib", "flax", "optax", "chex", "gymnasium", "numpy", "orbax-checkpoint")
+TABLES = ("seeds", "episodes", "evaluations")
+"""In the order they are written."""
+
+_NOT_COMPARED = ("out", "devices")
+
+
+def describe(grid: Grid) -> dict[str, Any]:
+    """The fully resolved configuration as JSON values."""
+    return _plain(dataclasses.asdict(grid))
+
+
+def open_folder(grid: Grid) -> Path:
+    """Make the run's folder, or enter it again.
+
+    Raises:
+        UserError: if it cannot be written, or holds a run of another configuration.
+    """
+    folder = grid.folder
+    path = folder / "config.json"
+    if path.exists():
+        _compare(path, describe(grid))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UserError(f"--out: cannot write to {folder} ({error.strerror})") from error
+    if not path.exists():
+        versions = {name: importlib.metadata.version(name) for name in PACKAGES}
+        config = {"schema": SCHEMA, "config": describe(grid), "versions": versions}
+        with replacing(path) as partial:
+            partial.write_text(json.dumps(config, indent=2) + "\n")
+    return folder
+
+
+def _compare(path: Path, config: dict[str, Any]) -> None:
+    try:
+        written = json.loads(path.read_text())
+        schema, before = written["schema"], written["config"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"--out: {path} is not a readable configuration ({error})") from error
+    if schema != SCHEMA:
+        raise UserError(f"--out: {path} has schema {schema!r}, this version writes {SCHEMA}")
+    before, now = _flat(before), _flat(config)
+    for name in sorted(before.keys() | now.keys()):
+        if name not in _NOT_COMPARED and before.get(name) != now.get(name):
+            raise UserError(
+                f"--out: {path.parent} holds a run with {_option(name)} {before.get(name)}, not "
+                f"{now.get(name)}; choose another folder or the same configuration"
+            )
+
+
+def read(folder: Path, name: str) -> pl.DataFrame | None:
+    """A table of the run, with its finished cells alone; None before the first cell is finished."""
+    path = folder / f"{name}.parquet"
+    done = folder / "evaluations.parquet"
+    if not done.exists():
+        return None
+    table = pl.read_parquet(path)
+    cells = pl.scan_parquet(done).select("method", "n_demos").unique().collect()
+    return table.join(cells, on=["method", "n_demos"], how="semi", maintain_order="left")
+
+
+def finished(folder: Path) -> set[tuple[str, int]]:
+    """`(method, n_demos)` of the finished cells.
+
+    Raises:
+        UserError: if a table is damaged.
+    """
+    try:
+        tables = [read(folder, name) for name in TABLES]
+    except (OSError, pl.exceptions.PolarsError) as error:
+        raise UserError(f"--out: {folder} holds a damaged table ({error})") from error
+    cells = [
+        set(table.select("method", "n_demos").unique().iter_rows())
+        for table in tables
+        if table is not None
+    ]
+    return set.intersection(*cells) if cells else set()
+
+
+def append(folder: Path, rows: dict[str, pl.DataFrame]) -> None:
+    """Add a finished cell's rows to every table."""
+    for name in TABLES:
+        before = read(folder, name)
+        table = rows[name] if before is None else pl.concat([before, rows[name]])
+        with replacing(folder / f"{name}.parquet") as partial:
+            table.write_parquet(partial)
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a path to write to, which then replaces `path` in one move; an error leaves nothing."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return str(value) if isinstance(value, Path) else value
+
+
+def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat = {}
+    for name, value in config.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, "" if name == "settings" else f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value
+    return flat
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")

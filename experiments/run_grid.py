@@ -1,0 +1,114 @@
+"""`python -m experiments.run_grid`: train the grid, print the summary, draw the figures."""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import polars as pl
+import tyro
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from experiments import grid as grid_lib
+from experiments.errors import UserError
+from experiments.presets import PRESETS, Grid
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    grid = parse(sys.argv[1:] if arguments is None else arguments)
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=120)
+    try:
+        grid_lib.check(grid)
+        devices = start_devices(grid)
+        summary = grid_lib.run(grid, devices, console)
+    except UserError as error:
+        print(f"run_grid: {error}", file=sys.stderr)
+        return 2
+    console.print(summary_table(summary))
+    console.print(f"Tables and figures: {grid.folder}", highlight=False, soft_wrap=True)
+    return 0
+
+
+def parse(arguments: Sequence[str]) -> Grid:
+    """The configuration: the preset's, with whatever else the command line says."""
+    # The preset decides every other default, so it is read first; tyro reports a wrong one.
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", default="tuned")
+    preset, _ = first.parse_known_args(list(arguments))
+    return tyro.cli(
+        Grid,
+        prog="python -m experiments.run_grid",
+        description=__doc__,
+        default=PRESETS.get(preset.preset, PRESETS["tuned"]),
+        args=list(arguments),
+    )
+
+
+def start_devices(grid: Grid) -> list[jax.Device]:
+    """Start JAX with as many CPU devices as the run uses, or take the GPUs there are.
+
+    Raises:
+        UserError: if more devices are asked for than there are.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    # A device wants a few seeds to itself: fewer than four a device do not fill a vector unit.
+    wanted = grid.devices or max(1, min(cores or 1, grid.seeds // 4))
+    if grid.devices is None or grid.devices <= (cores or 1):
+        jax.config.update("jax_num_cpu_devices", wanted)
+    devices = jax.devices()
+    available = len(devices) if devices[0].platform != "cpu" else cores or 1
+    if grid.devices is not None and grid.devices > available:
+        raise UserError(f"--devices: {grid.devices} asked, there are {available}")
+    return devices[: grid.devices]
+
+
+def summary_table(summary: pl.DataFrame) -> Table:
+    """The summary as a paper would print it."""
+    table = Table(title=f"{summary['seeds'].max()} seeds per row; 95% intervals", box=box.SIMPLE)
+    table.add_column("method")
+    table.add_column("N_T", justify="right")
+    for name in (
+        "converged",
+        "steps until\nconverged",
+        "dip fraction",
+        "area",
+        "final return",
+        "best policy",
+    ):
+        table.add_column(name, justify="right")
+    for row in summary.iter_rows(named=True):
+        table.add_row(
+            row["method"],
+            str(row["n_demos"]) if row["n_demos"] else "-",
+            _interval(row, "converged_fraction", "{:.2f}"),
+            _interval(row, "convergence_env_step_median", "{:,.0f}"),
+            _interval(row, "dip_fraction", "{:.3f}"),
+            _interval(row, "area", "{:.1f}"),
+            _spread(row, "final_return"),
+            _spread(row, "best_return"),
+        )
+    return table
+
+
+def _interval(row: dict[str, Any], name: str, form: str) -> str:
+    value, low, high = (row[name + end] for end in ("", "_low", "_high"))
+    if value is None:
+        return "never"
+    bounds = ("?" if bound is None else form.format(bound) for bound in (low, high))
+    return f"{form.format(value)}\n\\[{', '.join(bounds)}]"
+
+
+def _spread(row: dict[str, Any], name: str) -> str:
+    mean, std = row[f"{name}_mean"], row[f"{name}_std"]
+    return f"{mean:.2f}" if std is None else f"{mean:.2f}\n± {std:.2f}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
