@@ -118,10 +118,12 @@ def fit(
         index = demonstrations_lib.sample_index(key, chosen, hparams.batch_size)
         grads, params = jax.grad(loss, has_aux=True)(params, index)
         updates, state = optimizer.update(grads, state, params)
-        return (optax.apply_updates(params, updates), state), None
+        params: Any = optax.apply_updates(params, updates)
+        return (params, state), None
 
-    carry = (params, optimizer.init(params))
-    (fitted, _), _ = jax.lax.scan(step, carry, jax.random.split(key, hparams.steps))
+    (fitted, _), _ = jax.lax.scan(
+        step, (params, optimizer.init(params)), jax.random.split(key, hparams.steps)
+    )
     return fitted
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import demonstrations
+from cmedirl_jax import demonstrations, seeds
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.methods import METHODS, Settings

@@ -100,7 +100,7 @@ def summary_table(summary: pl.DataFrame) -> Table:
 def _interval(row: dict[str, Any], name: str, form: str) -> str:
     value, low, high = (row[name + end] for end in ("", "_low", "_high"))
     if value is None:
-        return "never"
+        return "-"
     bounds = ("?" if bound is None else form.format(bound) for bound in (low, high))
     return f"{form.format(value)}\n\\[{', '.join(bounds)}]"
 
