@@ -90,6 +90,7 @@ def subset(
 
 def sample_index(key: jax.Array, subset: DemonstrationSubset, batch_size: int) -> jax.Array:
     """Steps of the pool, `[batch_size]` int32, uniform over all steps of the subset's episodes."""
+    subset = jax.tree.map(jnp.asarray, subset)
     ends = jnp.cumsum(subset.length)
     step = jax.random.randint(key, (batch_size,), 0, ends[-1])
     which = jnp.searchsorted(ends, step, side="right")

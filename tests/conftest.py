@@ -1,0 +1,36 @@
+import hypothesis
+import numpy as np
+import pytest
+
+from cmedirl_jax import envs
+from cmedirl_jax.types import EnvSpec
+
+# The first example of a test compiles, so deadlines would only measure the compiler.
+hypothesis.settings.register_profile("reproducible", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("reproducible")
+
+
+@pytest.fixture(scope="session")
+def env():
+    return envs.make("MountainCarContinuous-v0")
+
+
+@pytest.fixture(scope="session")
+def spec(env):
+    return env.spec
+
+
+@pytest.fixture(scope="session")
+def skewed_spec():
+    """Three observations, two actions, and no bound that is the negative of another."""
+    return EnvSpec(
+        id="Skewed-v0",
+        observation_dim=3,
+        action_dim=2,
+        observation_low=np.array([-1.0, 0.0, 2.0], np.float32),
+        observation_high=np.array([3.0, 0.5, 10.0], np.float32),
+        action_low=np.array([-1.0, 0.5], np.float32),
+        action_high=np.array([3.0, 1.0], np.float32),
+        max_episode_steps=10,
+        reward_threshold=0.0,
+    )

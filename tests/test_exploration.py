@@ -1,0 +1,252 @@
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cmedirl_jax import envs, exploration
+from cmedirl_jax.exploration import (
+    EpsilonGreedyHParams,
+    GaussianHParams,
+    OrnsteinUhlenbeckHParams,
+)
+
+SPEC = envs.make("MountainCarContinuous-v0").spec._replace(
+    action_low=np.array([-1.0], np.float32), action_high=np.array([3.0], np.float32)
+)
+LOW, HIGH = SPEC.action_low[0], SPEC.action_high[0]
+HALF_WIDTH = 2.0
+KEY = jax.random.key(0)
+HELD_NOISE = 0.6
+
+
+def gaussian(spec=SPEC):
+    behaviour = exploration.gaussian(spec, GaussianHParams(scale=0.4))
+    return behaviour, behaviour.init(KEY), 0.0
+
+
+def ornstein_uhlenbeck(spec=SPEC):
+    behaviour = exploration.ornstein_uhlenbeck(
+        spec, OrnsteinUhlenbeckHParams(theta=0.25, sigma=0.4)
+    )
+    state = behaviour.init(KEY)
+    state = state.replace(value=jnp.full_like(state.value, HELD_NOISE))
+    return behaviour, state, 0.75 * HELD_NOISE
+
+
+noisy = pytest.mark.parametrize("make", [gaussian, ornstein_uhlenbeck])
+greedy_actions = pytest.mark.parametrize("mu", [-1.0, 0.2, 2.9])
+
+
+def perturb(behaviour, state, mu, noise):
+    """Actions and log densities for many noises `[B, A]`, at one greedy action."""
+    return jax.vmap(behaviour.perturb, in_axes=(None, None, 0, None))(
+        state, jnp.atleast_1d(jnp.asarray(mu, jnp.float32)), noise, 0
+    )[:2]
+
+
+@noisy
+@greedy_actions
+def test_clipped_normal_density_integrates_to_one(make, mu):
+    behaviour, state, shift = make()
+    scale = 0.4 * HALF_WIDTH
+    cell = (HIGH - LOW) / 2000
+    wanted = LOW + cell * (np.arange(2000) + 0.5)
+    noise = (wanted - (mu + shift)) / scale
+    action, log_density = perturb(behaviour, state, mu, noise[:, None].astype(np.float32))
+    np.testing.assert_allclose(action[:, 0], wanted, atol=1e-5)
+    bounds, log_mass = perturb(behaviour, state, mu, np.float32([[-20.0], [20.0]]))
+    np.testing.assert_array_equal(bounds[:, 0], [LOW, HIGH])
+    inside = cell * np.exp(np.float64(log_density)).sum()
+    assert inside + np.exp(np.float64(log_mass)).sum() == pytest.approx(1.0, abs=1e-5)
+
+
+@noisy
+@greedy_actions
+def test_clipped_normal_density_is_scipys(make, mu):
+    behaviour, state, shift = make()
+    law = scipy.stats.norm(mu + shift, 0.4 * HALF_WIDTH)
+    noise = np.linspace(-6, 6, 101, dtype=np.float32)[:, None]
+    action, log_density = perturb(behaviour, state, mu, noise)
+    action = np.float64(action[:, 0])
+    expected = np.select(
+        [action == LOW, action == HIGH], [law.logcdf(LOW), law.logsf(HIGH)], law.logpdf(action)
+    )
+    np.testing.assert_allclose(log_density, expected, rtol=1e-4, atol=1e-4)
+
+
+@noisy
+def test_densities_of_independent_dimensions_multiply(make, skewed_spec):
+    behaviour, state, shift = make(skewed_spec)
+    mu = np.array([0.0, 0.9], np.float32)
+    action, log_density = perturb(behaviour, state, mu, np.float32([[0.3, 8.0]]))
+    law = scipy.stats.norm(mu + shift, 0.4 * np.array([2.0, 0.25]))
+    assert action[0, 1] == skewed_spec.action_high[1]
+    expected = law.logpdf(action[0])[0] + law.logsf(skewed_spec.action_high)[1]
+    np.testing.assert_allclose(log_density[0], expected, rtol=1e-5)
+
+
+@noisy
+@greedy_actions
+def test_samples_follow_the_clipped_normal(make, mu):
+    behaviour, state, shift = make()
+    sample = jax.vmap(behaviour.sample, in_axes=(0, None, None, None))
+    action, _, _ = sample(jax.random.split(KEY, 20_000), state, jnp.float32([mu]), 0)
+    action = np.asarray(action[:, 0])
+    law = scipy.stats.norm(mu + shift, 0.4 * HALF_WIDTH)
+    below = [(action <= x).mean() for x in np.linspace(LOW, HIGH, 40)[:-1]]
+    expected = law.cdf(np.linspace(LOW, HIGH, 40))
+    # The Kolmogorov-Smirnov distance that chance exceeds once in a thousand.
+    np.testing.assert_allclose([*below, (action < HIGH).mean()], expected, atol=1.95 / 20_000**0.5)
+
+
+def test_ornstein_uhlenbeck_has_the_closed_form_variance_and_autocorrelation():
+    behaviour = exploration.ornstein_uhlenbeck(SPEC)
+
+    def advance(state, noise):
+        _, _, state = behaviour.perturb(state, jnp.zeros(1), noise, 0)
+        return state, state.value[0]
+
+    noise = jax.random.normal(KEY, (2000, 100, 1))
+    states = jax.vmap(behaviour.init)(jax.random.split(KEY, 100))
+    _, values = jax.lax.scan(jax.vmap(advance), states, noise)
+    values = np.asarray(values, np.float64)[100:]
+    variance = np.mean(values**2)
+    decay = 1 - 0.15
+    assert variance == pytest.approx((0.5 * HALF_WIDTH) ** 2 / (1 - decay**2), rel=0.03)
+    for lag in (1, 5, 10):
+        correlation = np.mean(values[lag:] * values[:-lag]) / variance
+        assert correlation == pytest.approx(decay**lag, abs=0.02)
+
+
+def test_ornstein_uhlenbeck_filters_its_noise():
+    behaviour = exploration.ornstein_uhlenbeck(SPEC)
+    noise = np.asarray(jax.random.normal(KEY, (50, 1)))
+
+    def advance(state, noise):
+        action, _, state = behaviour.perturb(state, jnp.float32([0.5]), noise, 0)
+        return state, action[0]
+
+    _, actions = jax.lax.scan(advance, behaviour.init(KEY), noise)
+    path = scipy.signal.lfilter([0.5 * HALF_WIDTH], [1, -0.85], np.float64(noise[:, 0]))
+    np.testing.assert_allclose(actions, np.clip(0.5 + path, LOW, HIGH), atol=1e-5)
+
+
+def test_noise_starts_again_at_zero_in_each_episode():
+    behaviour, state, _ = ornstein_uhlenbeck()
+    assert state.value == HELD_NOISE
+    fresh = behaviour.reset(state)
+    assert not fresh.value.any()
+    assert fresh.hparams == state.hparams
+
+
+SCHEDULE = [(0, 1.0), (1250, 0.7525), (2500, 0.505), (5000, 0.01), (12_000, 0.01)]
+
+
+@pytest.mark.parametrize(("step", "epsilon"), SCHEDULE)
+def test_epsilon_falls_linearly_and_stays(step, epsilon):
+    behaviour = exploration.epsilon_greedy(SPEC)
+    choices = (np.arange(10_000) + 0.5) / 10_000
+    noise = (choices.astype(np.float32), np.full((10_000, 1), 2.5, np.float32))
+    action, _, _ = jax.vmap(behaviour.perturb, in_axes=(None, None, 0, None))(
+        behaviour.init(KEY), jnp.zeros(1), noise, step
+    )
+    assert np.mean(action == 2.5) == pytest.approx(epsilon, abs=2e-4)
+
+
+@pytest.mark.parametrize(("step", "epsilon"), SCHEDULE)
+def test_epsilon_greedy_densities(step, epsilon):
+    behaviour = exploration.epsilon_greedy(SPEC)
+    noise = (np.array([0.0, 1.0], np.float32), np.full((2, 1), 2.5, np.float32))
+    action, log_density, _ = jax.vmap(behaviour.perturb, in_axes=(None, None, 0, None))(
+        behaviour.init(KEY), jnp.zeros(1), noise, step
+    )
+    np.testing.assert_array_equal(action[:, 0], [2.5, 0.0])
+    expected = [epsilon / (HIGH - LOW), 1 - epsilon]
+    np.testing.assert_allclose(np.exp(log_density), expected, rtol=1e-5)
+
+
+def test_random_actions_are_uniform_in_the_bounds():
+    behaviour = exploration.epsilon_greedy(SPEC)
+    action, _, _ = jax.vmap(behaviour.sample, in_axes=(0, None, None, None))(
+        jax.random.split(KEY, 10_000), behaviour.init(KEY), jnp.zeros(1), 2500
+    )
+    action = np.asarray(action[:, 0])
+    random = action[action != 0.0]
+    assert scipy.stats.binomtest(len(random), 10_000, 0.505).pvalue > 1e-3
+    assert scipy.stats.kstest(random, "uniform", (LOW, HIGH - LOW)).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("hold", [1, 3, 8])
+def test_random_actions_are_held_for_exactly_hold_steps(hold):
+    behaviour = exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=float(hold)))
+    state = behaviour.init(KEY)
+    actions, log_densities = [], []
+    for offered in range(hold + 2):
+        # Only the first choice is random: a held action must ignore those offered later.
+        noise = (jnp.float32(offered > 0), jnp.float32([2.0 + 0.01 * offered]))
+        action, log_density, state = behaviour.perturb(state, jnp.zeros(1), noise, 2500)
+        actions.append(float(action[0]))
+        log_densities.append(float(log_density))
+    assert actions == [2.0] * hold + [0.0] * 2
+    log_volume = math.log(HIGH - LOW)
+    expected = [math.log(0.505) - log_volume] + [-log_volume] * (hold - 1) + [math.log(0.495)] * 2
+    np.testing.assert_allclose(log_densities, expected, rtol=1e-5)
+
+
+def test_an_episode_does_not_inherit_a_held_action():
+    behaviour = exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=5.0))
+    begin, decline = (jnp.float32(0.0), jnp.ones(1)), (jnp.float32(1.0), jnp.ones(1))
+    _, _, state = behaviour.perturb(behaviour.init(KEY), jnp.zeros(1), begin, 2500)
+    action, _, _ = behaviour.perturb(behaviour.reset(state), jnp.zeros(1), decline, 2500)
+    assert action == 0.0
+
+
+MAKERS = [
+    exploration.gaussian(SPEC, GaussianHParams(scale=2.0)),
+    exploration.ornstein_uhlenbeck(SPEC, OrnsteinUhlenbeckHParams(sigma=2.0)),
+    exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=2.0)),
+]
+JITTED = [jax.jit(behaviour.sample) for behaviour in MAKERS]
+kinds = pytest.mark.parametrize("kind", range(3), ids=["gaussian", "ou", "epsilon_greedy"])
+
+
+@kinds
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    mu=st.floats(float(LOW), float(HIGH), width=32),
+    step=st.integers(0, 20_000),
+)
+def test_actions_stay_in_bounds_with_finite_density(kind, seed, mu, step):
+    state = MAKERS[kind].init(KEY)
+    for key in jax.random.split(jax.random.key(seed), 3):
+        action, log_density, state = JITTED[kind](key, state, jnp.float32([mu]), step)
+        assert LOW <= action <= HIGH
+        assert jnp.isfinite(log_density)
+
+
+@kinds
+def test_sample_is_perturb_of_draw(kind):
+    behaviour = MAKERS[kind]
+    state, mu = behaviour.init(KEY), jnp.float32([0.3])
+    sampled = behaviour.sample(KEY, state, mu, 100)
+    perturbed = behaviour.perturb(state, mu, behaviour.draw(KEY), 100)
+    jax.tree.map(np.testing.assert_array_equal, sampled, perturbed)
+
+
+def test_hyperparameters_can_be_vmapped_over():
+    behaviour = exploration.ornstein_uhlenbeck(SPEC)
+    sigmas = jnp.array([0.1, 0.2, 0.4])
+    state = behaviour.init(KEY)
+    states = jax.vmap(lambda sigma: state.replace(hparams=state.hparams.replace(sigma=sigma)))(
+        sigmas
+    )
+    action, _, _ = jax.vmap(behaviour.perturb, in_axes=(0, None, None, None))(
+        states, jnp.zeros(1), jnp.float32([0.7]), 0
+    )
+    np.testing.assert_allclose(action[:, 0], 0.7 * HALF_WIDTH * sigmas, rtol=1e-6)
