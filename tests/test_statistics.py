@@ -59,7 +59,6 @@ def test_seed_statistics_of_hand_made_curves(returns, expected):
 
 
 @given(st.lists(st.integers(-5, 5), min_size=1, max_size=12))
-@settings(deadline=None)
 def test_seed_statistics_match_a_loop_over_the_evaluations(returns):
     threshold = 2
     hits = [i for i, value in enumerate(returns) if value >= threshold]
@@ -91,7 +90,6 @@ def test_share_has_the_clopper_pearson_interval(count):
 
 
 @given(st.lists(st.integers(0, 20) | st.just(math.inf), min_size=1, max_size=40))
-@settings(deadline=None)
 def test_median_is_the_lower_one_between_symmetric_order_statistics(values):
     ordered, count = sorted(values), len(values)
     # The 1-based rank of the lower end: P(Binomial(count, 1/2) < rank) <= 2.5%.
@@ -122,7 +120,7 @@ def test_mean_of_equal_values_has_an_interval_of_no_width(values):
 
 
 @given(st.lists(st.integers(-100, 100), min_size=1, max_size=15))
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 def test_interquartile_mean_drops_a_quarter_of_the_sorted_values_at_each_end(values):
     cut = len(values) // 4
     middle = sorted(values)[cut : len(values) - cut]

@@ -1,0 +1,34 @@
+"""The README's commands and code are what it says they are."""
+
+import re
+from pathlib import Path
+
+import jax
+import pytest
+
+README = Path(__file__).parent.parent / "README.md"
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README.read_text(), flags=re.DOTALL)
+
+
+def test_the_quick_start_is_two_one_line_commands():
+    quick_start = README.read_text().split("## Quick start")[1].split("\n## ")[0]
+    commands = re.findall(r"```bash\n(.*?)```", quick_start, flags=re.DOTALL)
+    assert len(commands) == 2
+    assert all(command.count("\n") == 1 for command in commands)
+    assert "python -m experiments.run_grid\n" in commands[0]
+    assert "python -m pytest\n" in commands[1]
+
+
+@pytest.mark.parametrize("code", blocks("python"), ids=lambda code: code.splitlines()[0])
+def test_the_examples_run(code):
+    names = {}
+    exec(compile(code, str(README), "exec"), names)
+    leaves = [leaf for leaf in names.values() if isinstance(leaf, jax.Array)]
+    assert all(bool(jax.numpy.isfinite(leaf).all()) for leaf in leaves if leaf.dtype.kind == "f")
+
+
+def test_there_are_examples():
+    assert len(blocks("python")) >= 2
