@@ -91,17 +91,18 @@ def test_a_flipped_bit_is_refused_or_harmless(path, saved, position, bit):
     content[int(position * len(content))] ^= 1 << bit
     path.write_bytes(content)
     try:
-        assert_equal(demonstrations.load(path), POOL)
-    except ValueError as error:
-        assert path.name in str(error)
+        loaded = demonstrations.load(path)
+    except ValueError:
+        return
+    assert_equal(loaded, POOL)
 
 
-# Offsets into a zip file's central directory: the version needed, the flags (bit 0: encrypted), the
-# compression method.
-@pytest.mark.parametrize(("offset", "value"), [(6, 0xFF), (8, 1), (10, 14), (10, 99)])
+# Offsets into an entry of a zip file's central directory: the version needed to extract it, its
+# flags (1: encrypted) and its compression method (12: bzip2, 14: lzma, 99: none there is).
+@pytest.mark.parametrize(("offset", "value"), [(6, 255), (8, 1), (10, 12), (10, 14), (10, 99)])
 def test_a_damaged_zip_directory_is_refused(path, saved, offset, value):
     content = bytearray(saved)
-    content[saved.index(b"PK\x01\x02") + offset] ^= value
+    content[saved.index(b"PK\x01\x02") + offset] = value
     path.write_bytes(content)
     with pytest.raises(ValueError, match=path.name):
         demonstrations.load(path)
@@ -311,13 +312,19 @@ def test_a_sample_is_whole_transitions_of_the_pool():
 @given(lengths=episode_lengths, discount=st.floats(0, 1))
 def test_returns_equal_brute_force(lengths, discount):
     pool = make_pool(lengths)
-    total, discounted = [], []
-    for start, length in zip(np.cumsum([0, *lengths[:-1]]), lengths, strict=True):
-        reward = pool.transition.reward[start : start + length].astype(np.float64)
-        total.append(reward.sum())
-        for t in range(length):
-            discounted.append(sum(discount**k * r for k, r in enumerate(reward[t:])))
-    np.testing.assert_allclose(demonstrations.returns(pool), total, rtol=1e-12)
+    starts = np.cumsum([0, *lengths[:-1]])
+    rewards = [
+        pool.transition.reward[start : start + length].astype(np.float64)
+        for start, length in zip(starts, lengths, strict=True)
+    ]
+    np.testing.assert_allclose(
+        demonstrations.returns(pool), [sum(reward) for reward in rewards], rtol=1e-12
+    )
+    expected = [
+        sum(discount**k * later for k, later in enumerate(reward[t:]))
+        for reward in rewards
+        for t in range(len(reward))
+    ]
     actual = demonstrations.discounted_returns(pool, discount)
     assert actual.dtype == np.float32
-    np.testing.assert_allclose(actual, discounted, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-7)

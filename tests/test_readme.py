@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import pytest
 
 README = Path(__file__).parent.parent / "README.md"
@@ -26,8 +27,10 @@ def test_the_quick_start_is_two_one_line_commands():
 def test_the_examples_run(code):
     names = {}
     exec(compile(code, str(README), "exec"), names)
-    leaves = [leaf for leaf in names.values() if isinstance(leaf, jax.Array)]
-    assert all(bool(jax.numpy.isfinite(leaf).all()) for leaf in leaves if leaf.dtype.kind == "f")
+    arrays = [leaf for leaf in jax.tree.leaves(list(names.values())) if isinstance(leaf, jax.Array)]
+    numbers = [leaf for leaf in arrays if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    assert numbers
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in numbers)
 
 
 def test_there_are_examples():

@@ -1,0 +1,347 @@
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+from cmedirl_jax.ddpg import DDPGHParams
+from cmedirl_jax.methods import METHODS, Schedule, Settings
+from cmedirl_jax.networks import Architecture
+from cmedirl_jax.training import Log
+from experiments import cells, judging
+from experiments.cells import Budget, CellResult, Progress
+
+SEEDS = 3
+STARTS, STARTS_BY_EPISODES = 5, 7
+LEARNING_STARTS = 20
+LIMIT = 25
+BY_STEPS = Budget(120, None, 50, STARTS)
+BY_STEPS_IN_TWO = Budget(120, None, 100, STARTS)
+BY_EPISODES = Budget(6 * LIMIT, 6, 50, STARTS, 2, STARTS_BY_EPISODES)
+KEY = jax.random.key(5)
+
+
+class Chunk(NamedTuple):
+    """What one call of the training program did."""
+
+    steps: np.ndarray
+    log: Log
+    actor: Any
+
+
+class Trained(NamedTuple):
+    """A cell, and what it was made from."""
+
+    result: CellResult
+    chunks: list[Chunk]
+    reports: list[Progress]
+
+
+@pytest.fixture(scope="module")
+def programs(env):
+    """Linear DDPG where episodes of 25 steps start near the goal, so that some reach it."""
+    params = env.default_params.replace(max_episode_steps=LIMIT, start_low=0.35, start_high=0.44, power=0.004)
+    spec = env.spec._replace(max_episode_steps=LIMIT)
+    short = env._replace(spec=spec, default_params=params)
+    settings = Settings(
+        architecture=Architecture(hidden=(), output_scale=0.3),
+        agent=DDPGHParams(actor_learning_rate=1.0, critic_learning_rate=0.1),
+        schedule=Schedule(batch_size=4, learning_starts=LEARNING_STARTS),
+    )
+    devices = jax.devices()[:1]
+    return cells.compile_method(
+        short,
+        METHODS["ddpg"],
+        settings,
+        judging.make(short, settings.architecture, 2, devices),
+        group=2,
+        seeds_count=SEEDS,
+        devices=devices,
+        capacity=BY_EPISODES.max_steps,
+        subset_size=None,
+    )
+
+
+def train(programs, budget, *, threshold=0.0, before_chunk=lambda state, first_step: state):
+    chunks, reports = [], []
+
+    def run(state, data, steps, limit):
+        state, log = programs.run(before_chunk(state, int(steps[0])), data, steps, limit)
+        # Copies: the next call is given the state to overwrite.
+        chunks.append(jax.tree.map(np.array, Chunk(steps, log, state.agent.actor)))
+        return state, log
+
+    result = cells.train(
+        programs._replace(run=run),
+        KEY,
+        None,
+        0,
+        seeds_count=SEEDS,
+        budget=budget,
+        threshold=threshold,
+        report=reports.append,
+    )
+    return Trained(result, chunks, reports)
+
+
+@pytest.fixture(scope="module")
+def by_steps(programs):
+    return train(programs, BY_STEPS)
+
+
+@pytest.fixture(scope="module")
+def by_episodes(programs):
+    return train(programs, BY_EPISODES)
+
+
+def evaluation_rows(result, protocol="steps", seed=None):
+    """Every evaluation as `(seed, env_step, episode, return_mean, q_mean, critic_loss)`."""
+    return [
+        row
+        for found in result.evaluations
+        if found.protocol == protocol
+        for row in zip(
+            found.seed,
+            found.env_step,
+            found.episode,
+            found.evaluation.return_mean,
+            found.q_mean,
+            found.critic_loss,
+            strict=True,
+        )
+        if seed is None or row[0] == seed
+    ]
+
+
+def episode_rows(result, seed=None):
+    """Every finished episode as `(seed, episode, env_step, return, length, terminated)`."""
+    rows = zip(*result.episodes, strict=True)
+    return sorted(row for row in rows if seed is None or row[0] == seed)
+
+
+def actor_of(actors, seed):
+    return jax.tree.map(lambda leaf: leaf[seed], actors)
+
+
+def assert_same(one, another):
+    jax.tree.map(np.testing.assert_array_equal, one, another)
+
+
+def mean_return(programs, actor, starts):
+    return np.asarray(programs.judge.on_starts(actor, starts).episode_return).mean(axis=1)
+
+
+def test_every_seed_is_first_evaluated_at_step_0_before_any_update(by_steps):
+    first = by_steps.result.evaluations[0]
+    assert first.protocol == "steps"
+    np.testing.assert_array_equal(first.seed, np.arange(SEEDS))
+    np.testing.assert_array_equal(first.env_step, np.zeros(SEEDS))
+    np.testing.assert_array_equal(first.episode, np.zeros(SEEDS))
+    assert np.isnan(first.q_mean).all()
+    assert np.isnan(first.critic_loss).all()
+
+
+def test_evaluations_come_at_the_multiples_and_at_the_end(by_steps):
+    for seed in range(SEEDS):
+        steps = [row[1] for row in evaluation_rows(by_steps.result, seed=seed)]
+        assert steps == [0, 50, 100, 120]
+
+
+def test_an_evaluation_is_of_the_policy_at_that_step(by_steps, programs):
+    for found, chunk in zip(by_steps.result.evaluations[1:], by_steps.chunks, strict=True):
+        expected = mean_return(programs, chunk.actor, STARTS)[:SEEDS]
+        np.testing.assert_array_equal(found.evaluation.return_mean, expected)
+
+
+def test_q_mean_and_critic_loss_are_means_over_the_updates_since_the_last_evaluation(by_steps):
+    for found, chunk in zip(by_steps.result.evaluations[1:], by_steps.chunks, strict=True):
+        updates = chunk.steps >= LEARNING_STARTS
+        for column in ("q_mean", "critic_loss"):
+            expected = getattr(chunk.log, column)[:SEEDS, updates].mean(axis=1)
+            np.testing.assert_allclose(getattr(found, column), expected, rtol=1e-5)
+
+
+def test_episodes_are_those_of_the_log(by_steps):
+    expected = []
+    for seed in range(SEEDS):
+        number = 0
+        for chunk in by_steps.chunks:
+            for index, step in enumerate(chunk.steps):
+                if chunk.log.done[seed, index]:
+                    number += 1
+                    columns = ("episode_return", "episode_length", "terminated")
+                    logged = [getattr(chunk.log, name)[seed, index] for name in columns]
+                    expected.append((seed, number, step + 1, *logged))
+    assert episode_rows(by_steps.result) == expected
+
+
+@pytest.mark.parametrize("run", ["by_steps", "by_episodes"])
+def test_episodes_follow_each_other_without_gaps(run, request):
+    result = request.getfixturevalue(run).result
+    ended_at_goal = set()
+    for seed in range(SEEDS):
+        _, number, env_step, returns, length, terminated = map(
+            np.array, zip(*episode_rows(result, seed), strict=True)
+        )
+        np.testing.assert_array_equal(number, np.arange(number.size) + 1)
+        np.testing.assert_array_equal(np.diff(env_step, prepend=0), length)
+        assert ((length == LIMIT) | terminated & (length < LIMIT)).all()
+        cost = 100.0 * terminated - returns
+        assert ((cost >= -1e-4) & (cost <= 0.1 * length + 1e-4)).all()
+        ended_at_goal |= set(terminated)
+    assert ended_at_goal == {True, False}
+
+
+def test_an_evaluation_counts_the_episodes_finished_by_then(by_steps):
+    for seed, env_step, episode, *_ in evaluation_rows(by_steps.result):
+        assert episode == sum(row[2] <= env_step for row in episode_rows(by_steps.result, seed))
+
+
+def test_a_cell_by_steps_ends_after_all_its_steps(by_steps):
+    result = by_steps.result
+    np.testing.assert_array_equal(result.env_steps, [BY_STEPS.max_steps] * SEEDS)
+    np.testing.assert_array_equal(result.demonstration_steps, np.zeros(SEEDS))
+    assert not result.diverged.any()
+    assert result.reward is None
+    for seed in range(SEEDS):
+        assert_same(actor_of(result.final, seed), actor_of(by_steps.chunks[-1].actor, seed))
+
+
+@pytest.mark.parametrize("run", ["by_steps", "by_episodes"])
+def test_the_best_policy_returns_each_seeds_highest_evaluation(run, request, programs):
+    result = request.getfixturevalue(run).result
+    highest = [max(row[3] for row in evaluation_rows(result, seed=seed)) for seed in range(SEEDS)]
+    np.testing.assert_array_equal(mean_return(programs, result.best, STARTS), highest)
+
+
+def test_reports_follow_the_steps_and_the_share_of_seeds_at_the_threshold(programs, by_steps):
+    returns = [found.evaluation.return_mean for found in by_steps.result.evaluations]
+    threshold = float(np.median(returns))
+    expected = [
+        Progress(step, np.mean(at_step >= threshold))
+        for step, at_step in zip((0, 50, 100, 120), returns, strict=True)
+    ]
+    assert train(programs, BY_STEPS, threshold=threshold).reports == expected
+
+
+def test_the_size_of_the_chunks_changes_nothing_but_the_reports(programs, by_steps, monkeypatch):
+    monkeypatch.setattr(cells, "CHUNK", 50)
+    chunked = train(programs, BY_STEPS_IN_TWO)
+    assert [report.env_step for report in chunked.reports] == [0, 50, 100, 120]
+    assert episode_rows(chunked.result) == episode_rows(by_steps.result)
+    for seed in range(SEEDS):
+        rows = evaluation_rows(chunked.result, seed=seed)
+        assert [row[1] for row in rows] == [0, 100, 120]
+        assert rows[2] == evaluation_rows(by_steps.result, seed=seed)[3]
+        _, fifty, hundred, _ = evaluation_rows(by_steps.result, seed=seed)
+        assert rows[1][:4] == hundred[:4]
+        updates = np.array([50 - LEARNING_STARTS, 50])
+        for column in (4, 5):
+            pooled = np.dot(updates, (fifty[column], hundred[column])) / updates.sum()
+            np.testing.assert_allclose(rows[1][column], pooled, rtol=1e-6)
+
+
+def test_each_seed_ends_with_its_last_episode(by_episodes):
+    result = by_episodes.result
+    for seed in range(SEEDS):
+        rows = episode_rows(result, seed)
+        end = rows[-1][2]
+        assert len(rows) == BY_EPISODES.max_episodes
+        assert result.env_steps[seed] == end
+        assert evaluation_rows(result, seed=seed)[-1][1:3] == (end, BY_EPISODES.max_episodes)
+    assert len(set(result.env_steps)) > 1
+
+
+def test_a_seed_that_has_ended_is_evaluated_once_more_and_learns_no_more(by_episodes):
+    result = by_episodes.result
+    for seed in range(SEEDS):
+        end = result.env_steps[seed]
+        steps = [row[1] for row in evaluation_rows(result, seed=seed)]
+        assert steps == [*range(0, end, BY_EPISODES.evaluate_every), end]
+        for chunk in by_episodes.chunks:
+            if chunk.steps[-1] >= end - 1:
+                assert_same(actor_of(chunk.actor, seed), actor_of(result.final, seed))
+
+
+def test_an_ended_seeds_last_evaluation_is_of_its_final_policy(by_episodes, programs):
+    last = [evaluation_rows(by_episodes.result, seed=seed)[-1][3] for seed in range(SEEDS)]
+    np.testing.assert_array_equal(mean_return(programs, by_episodes.result.final, STARTS), last)
+
+
+def test_updates_after_a_seeds_end_do_not_count(by_episodes):
+    for seed in range(SEEDS):
+        end = by_episodes.result.env_steps[seed]
+        (chunk,) = (c for c in by_episodes.chunks if c.steps[0] < end <= c.steps[-1] + 1)
+        before = (chunk.steps >= LEARNING_STARTS) & (chunk.steps < end)
+        q_mean = evaluation_rows(by_episodes.result, seed=seed)[-1][4]
+        np.testing.assert_allclose(q_mean, chunk.log.q_mean[seed, before].mean(), rtol=1e-5)
+
+
+def test_a_cell_ends_by_steps_or_by_episodes_whichever_comes_first(programs, by_episodes):
+    ends = by_episodes.result.env_steps
+    steps = int(np.sort(ends)[1]) // 50 * 50
+    result = train(programs, dataclasses.replace(BY_EPISODES, max_steps=steps)).result
+    np.testing.assert_array_equal(result.env_steps, np.minimum(ends, steps))
+
+
+def test_evaluations_by_episodes_come_with_the_chunk_that_passes_another_multiple(
+    by_episodes, programs
+):
+    expected = []
+    passed = dict.fromkeys(range(SEEDS), 0)
+    for chunk in by_episodes.chunks:
+        step = chunk.steps[-1] + 1
+        returns = mean_return(programs, chunk.actor, STARTS_BY_EPISODES)
+        for seed, before in passed.items():
+            number = sum(row[2] <= step for row in episode_rows(by_episodes.result, seed))
+            if number // 2 > before:
+                passed[seed] = number // 2
+                end = min(step, by_episodes.result.env_steps[seed])
+                expected.append((seed, end, number, returns[seed]))
+    found = [row[:4] for row in evaluation_rows(by_episodes.result, "episodes")]
+    assert found == expected
+
+
+def diverge_at(step, *which):
+    """Give the seeds `which` an infinite learning rate from `step` on."""
+
+    def before_chunk(state, first_step):
+        if first_step != step:
+            return state
+        hparams = state.agent.hparams
+        rate = hparams.actor_learning_rate.at[np.array(which)].set(np.inf)
+        return state.replace(
+            agent=state.agent.replace(hparams=hparams.replace(actor_learning_rate=rate))
+        )
+
+    return before_chunk
+
+
+def test_a_diverged_seed_is_marked_and_the_others_do_not_notice(programs, by_steps):
+    result = train(programs, BY_STEPS, before_chunk=diverge_at(50, 1)).result
+    np.testing.assert_array_equal(result.diverged, [False, True, False])
+    np.testing.assert_array_equal(result.env_steps, [120, 100, 120])
+    for seed in (0, 2):
+        np.testing.assert_array_equal(
+            evaluation_rows(result, seed=seed), evaluation_rows(by_steps.result, seed=seed)
+        )
+        assert episode_rows(result, seed) == episode_rows(by_steps.result, seed)
+        assert_same(actor_of(result.best, seed), actor_of(by_steps.result.best, seed))
+
+
+def test_a_diverged_seed_gets_no_further_rows_and_keeps_its_best_policy(programs, by_steps):
+    result = train(programs, BY_STEPS, before_chunk=diverge_at(50, 1)).result
+    np.testing.assert_array_equal(
+        evaluation_rows(result, seed=1), evaluation_rows(by_steps.result, seed=1)[:2]
+    )
+    assert all(row[2] <= 100 for row in episode_rows(result, 1))
+    highest = max(row[3] for row in evaluation_rows(result, seed=1))
+    assert mean_return(programs, result.best, STARTS)[1] == highest
+
+
+def test_a_cell_ends_when_every_seed_has_diverged(programs):
+    trained = train(programs, BY_STEPS, before_chunk=diverge_at(0, *range(SEEDS)))
+    assert trained.result.diverged.all()
+    assert [report.env_step for report in trained.reports] == [0, 50]
+    assert len(trained.result.evaluations) == 1

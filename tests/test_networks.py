@@ -1,0 +1,216 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from cmedirl_jax import networks
+from cmedirl_jax.networks import Architecture
+
+KEY = jax.random.key(0)
+NORMALISATIONS = ["none", "layer", "batch"]
+normalisations = pytest.mark.parametrize("normalisation", NORMALISATIONS)
+
+
+def randomised(variables):
+    """Variables whose every leaf matters: running variances positive, nothing zero or one."""
+    rng = np.random.default_rng(0)
+    variables = jax.tree.map(lambda leaf: rng.normal(0.1, 0.7, leaf.shape), variables)
+    for statistics in variables.get("batch_stats", {}).values():
+        statistics["var"] = np.exp(statistics["var"])
+    return jax.tree.map(np.float32, variables)
+
+
+def reference(variables, x, joined=None, *, normalisation, join=0, train=False):
+    """The perceptron in float64, and where its running statistics move to in training."""
+    params, moved = variables["params"], {}
+    depth = sum(name.startswith("Dense") for name in params) - 1
+    for index in range(depth):
+        if joined is not None and index == join:
+            x = np.concatenate([x, joined], axis=-1)
+        x = x @ params[f"Dense_{index}"]["kernel"] + params[f"Dense_{index}"]["bias"]
+        if normalisation == "layer":
+            mean, variance = x.mean(-1, keepdims=True), x.var(-1, keepdims=True)
+            x = (x - mean) / np.sqrt(variance + 1e-5)
+        elif normalisation == "batch":
+            name = f"BatchNorm_{index}"
+            running = variables["batch_stats"][name]
+            mean, variance = running["mean"], running["var"]
+            if train:
+                mean, variance = x.mean(0), x.var(0)
+                moved[name] = {
+                    "mean": 0.99 * running["mean"] + 0.01 * mean,
+                    "var": 0.99 * running["var"] + 0.01 * variance,
+                }
+            x = (x - mean) / np.sqrt(variance + 1e-5) * params[name]["scale"] + params[name]["bias"]
+        x = np.maximum(x, 0.0)
+    return x @ params[f"Dense_{depth}"]["kernel"] + params[f"Dense_{depth}"]["bias"], moved
+
+
+def inputs(spec, *leading):
+    rng = np.random.default_rng(1)
+    observation = rng.uniform(
+        spec.observation_low, spec.observation_high, (*leading, spec.observation_dim)
+    )
+    action = rng.uniform(spec.action_low, spec.action_high, (*leading, spec.action_dim))
+    return observation.astype(np.float32), action.astype(np.float32)
+
+
+def scaled(spec, observation):
+    low, high = np.float64(spec.observation_low), np.float64(spec.observation_high)
+    return 2 * (observation - low) / (high - low) - 1
+
+
+def float64(tree):
+    return jax.tree.map(np.float64, tree)
+
+
+@normalisations
+@pytest.mark.parametrize("normalise_observation", [True, False])
+@pytest.mark.parametrize("leading", [(), (5,), (2, 3)])
+def test_actor_is_the_perceptron(skewed_spec, normalisation, normalise_observation, leading):
+    architecture = Architecture(
+        hidden=(8, 6),
+        actor_normalisation=normalisation,
+        normalise_observation=normalise_observation,
+    )
+    actor = networks.make(skewed_spec, architecture).actor
+    variables = randomised(actor.init(KEY))
+    observation, _ = inputs(skewed_spec, *leading)
+    x = scaled(skewed_spec, observation) if normalise_observation else observation
+    expected, _ = reference(float64(variables), x, normalisation=normalisation)
+    output = actor.apply(variables, observation)
+    assert output.shape == (*leading, skewed_spec.action_dim)
+    np.testing.assert_allclose(output, expected, rtol=1e-4, atol=1e-4)
+
+
+@normalisations
+@pytest.mark.parametrize("action_layer", [0, 1])
+@pytest.mark.parametrize("leading", [(), (5,), (2, 3)])
+def test_critic_is_the_perceptron(skewed_spec, normalisation, action_layer, leading):
+    architecture = Architecture(
+        hidden=(8, 6), critic_normalisation=normalisation, action_layer=action_layer
+    )
+    critic = networks.make(skewed_spec, architecture).critic
+    variables = randomised(critic.init(KEY))
+    observation, action = inputs(skewed_spec, *leading)
+    expected, _ = reference(
+        float64(variables),
+        scaled(skewed_spec, observation),
+        action,
+        normalisation=normalisation,
+        join=action_layer,
+    )
+    output = critic.apply(variables, observation, action)
+    assert output.shape == leading
+    np.testing.assert_allclose(output, expected[..., 0], rtol=1e-4, atol=1e-4)
+
+
+def test_training_normalises_by_the_batch_and_moves_the_running_statistics(skewed_spec):
+    architecture = Architecture(hidden=(8, 6), critic_normalisation="batch", action_layer=1)
+    critic = networks.make(skewed_spec, architecture).critic
+    variables = randomised(critic.init(KEY))
+    observation, action = inputs(skewed_spec, 32)
+    output, moved = critic.train(variables, observation, action)
+    expected, expected_moved = reference(
+        float64(variables),
+        scaled(skewed_spec, observation),
+        action,
+        normalisation="batch",
+        join=1,
+        train=True,
+    )
+    np.testing.assert_allclose(output, expected[:, 0], rtol=1e-4, atol=1e-4)
+    assert set(moved) == {"params", "batch_stats"}
+    jax.tree.map(np.testing.assert_array_equal, moved["params"], variables["params"])
+    jax.tree.map(
+        lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6),
+        moved["batch_stats"],
+        expected_moved,
+    )
+
+
+@normalisations
+def test_only_batch_normalisation_has_statistics_to_train(skewed_spec, normalisation):
+    architecture = Architecture(
+        hidden=(4,), actor_normalisation=normalisation, critic_normalisation=normalisation
+    )
+    for network in networks.make(skewed_spec, architecture)[:2]:
+        assert (network.train is not None) == (normalisation == "batch")
+
+
+def test_train_mode_of_a_network_without_statistics_is_apply(skewed_spec):
+    critic = networks.make(skewed_spec).critic
+    params = critic.init(KEY)
+    batch = inputs(skewed_spec, 4)
+    output, same = networks.train_mode(critic)(params, *batch)
+    np.testing.assert_array_equal(output, critic.apply(params, *batch))
+    assert same is params
+
+
+@pytest.mark.parametrize(("hidden", "action_layer"), [((), 0), ((8,), 0), ((8, 6), 1)])
+def test_critic_depends_on_the_action(skewed_spec, hidden, action_layer):
+    architecture = Architecture(hidden=hidden, action_layer=action_layer)
+    critic = networks.make(skewed_spec, architecture).critic
+    variables = randomised(critic.init(KEY))
+    observation, action = inputs(skewed_spec, 4)
+    assert jnp.all(
+        critic.apply(variables, observation, action)
+        != critic.apply(variables, observation, action + 0.1)
+    )
+
+
+def test_initial_weights_are_uniform_in_their_ranges(skewed_spec):
+    architecture = Architecture(hidden=(200, 100), action_layer=1)
+    observation_dim, action_dim = skewed_spec.observation_dim, skewed_spec.action_dim
+    both = networks.make(skewed_spec, architecture)
+    for network, fan_in in (
+        (both.actor, (observation_dim, 200)),
+        (both.critic, (observation_dim, 200 + action_dim)),
+    ):
+        layers = network.init(KEY)["params"]
+        bounds = [1 / np.sqrt(fan_in[0]), 1 / np.sqrt(fan_in[1]), 3e-3]
+        for index, bound in enumerate(bounds):
+            layer = layers[f"Dense_{index}"]
+            weights = np.concatenate([layer["kernel"].ravel(), layer["bias"]])
+            assert np.abs(layer["bias"]).max() <= bound
+            law = ("uniform", (-bound, 2 * bound))
+            assert scipy.stats.kstest(weights, *law).pvalue > 1e-3
+
+
+def test_output_scale_is_the_range_of_the_last_layer(skewed_spec):
+    architecture = Architecture(hidden=(400,), output_scale=0.1)
+    kernel = networks.make(skewed_spec, architecture).critic.init(KEY)["params"]["Dense_1"][
+        "kernel"
+    ]
+    assert 0.09 < np.abs(kernel).max() <= 0.1
+
+
+def test_squashing_reaches_the_action_bounds(skewed_spec):
+    squash = networks.make(skewed_spec).squash
+    low, high = skewed_spec.action_low, skewed_spec.action_high
+    np.testing.assert_array_equal(squash(jnp.full(2, -20.0)), low)
+    np.testing.assert_array_equal(squash(jnp.full(2, 20.0)), high)
+    x = np.array([0.0, 0.5])
+    np.testing.assert_allclose(squash(x), (low + high) / 2 + (high - low) / 2 * np.tanh(x))
+
+
+def test_observation_scaling_maps_the_bounds_to_one(skewed_spec):
+    scale = networks.observation_scaling(skewed_spec)
+    low, high = skewed_spec.observation_low, skewed_spec.observation_high
+    np.testing.assert_allclose(scale(low), [-1, -1, -1], rtol=1e-6)
+    np.testing.assert_allclose(scale(high), [1, 1, 1], rtol=1e-6)
+    np.testing.assert_allclose(scale((low + high) / 2), [0, 0, 0], atol=1e-6)
+
+
+def test_infinite_observation_bounds_cannot_be_normalised(skewed_spec):
+    unbounded = skewed_spec._replace(observation_high=np.array([1, np.inf, 1], np.float32))
+    with pytest.raises(ValueError, match=r"Skewed-v0.*finite bounds"):
+        networks.make(unbounded)
+    networks.make(unbounded, Architecture(normalise_observation=False))
+
+
+@pytest.mark.parametrize("action_layer", [-1, 2])
+def test_the_action_must_join_at_a_hidden_layer(skewed_spec, action_layer):
+    with pytest.raises(ValueError, match=f"one of the 2 hidden layers, got {action_layer}"):
+        networks.make(skewed_spec, Architecture(hidden=(8, 6), action_layer=action_layer))
