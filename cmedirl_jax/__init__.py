@@ -1,6 +1,7 @@
 """Continuous maximum-entropy deep inverse reinforcement learning with hot-started DDPG, in JAX."""
 
 from cmedirl_jax import (
+    checkpoint,
     ddpg,
     demonstrations,
     envs,
@@ -11,6 +12,7 @@ from cmedirl_jax import (
     networks,
     replay,
     rewards,
+    schedules,
     seeds,
     shaping,
     training,
@@ -25,6 +27,7 @@ __all__ = [
     "Network",
     "Settings",
     "Transition",
+    "checkpoint",
     "ddpg",
     "demonstrations",
     "envs",
@@ -35,6 +38,7 @@ __all__ = [
     "networks",
     "replay",
     "rewards",
+    "schedules",
     "seeds",
     "shaping",
     "training",

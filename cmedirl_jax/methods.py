@@ -15,6 +15,7 @@ from cmedirl_jax.hot_start import HotStartHParams
 from cmedirl_jax.irl import IRLHParams, RewardLearner
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.replay import Replay
+from cmedirl_jax.schedules import RewardSchedule, Schedule
 from cmedirl_jax.types import EnvSpec
 
 
@@ -59,46 +60,6 @@ class ExplorationSettings:
     ornstein_uhlenbeck: OrnsteinUhlenbeckHParams = OrnsteinUhlenbeckHParams()
     gaussian: GaussianHParams = GaussianHParams()
     epsilon_greedy: EpsilonGreedyHParams = EpsilonGreedyHParams()
-
-
-@dataclasses.dataclass(frozen=True)
-class RewardSchedule:
-    """When the reward is learned, and from what."""
-
-    period: int = 4
-    """Environment steps between updates of the reward."""
-    iterations: int = 1
-    """Iterations K of Algorithm 1 at each update."""
-    stop: int | None = 2000
-    """Environment step from which r_D is frozen (and kept); None: never."""
-    anneal_steps: int | None = None
-    """Environment steps over which the weight of r_D falls linearly to 0; None: stays 1."""
-    batch_size: int = 32
-    """Demonstrated pairs per update, and background pairs per update."""
-    recent: int | None = 2000
-    """Background: the latest transitions of the replay; None: all collected so far."""
-    storage: Literal["recompute", "store"] = "recompute"
-    """Compute r_D anew when a transition is sampled, or store r* = r_D + r_e at collection."""
-    hidden: tuple[int, ...] = (64, 64)
-    """Units of each hidden layer of the reward network."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Schedule:
-    """The training loop."""
-
-    batch_size: int = 32
-    """Transitions per update."""
-    replay_capacity: int | None = None
-    """Transitions the replay holds; None: every one of the run."""
-    learning_starts: int = 200
-    """Environment steps before the first update."""
-    update_period: int = 1
-    """Environment steps between updates of actor and critic."""
-    target_period: int = 1
-    """Environment steps between target updates (the paper: 300, with agent.tau 1)."""
-    behaviour_cloning_steps: int = 4000
-    """Environment steps over which agent.behaviour_cloning falls linearly to 0."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,8 @@ from cmedirl_jax.envs import Env
 from cmedirl_jax.methods import METHODS, Settings
 from cmedirl_jax.types import Transition
 from experiments import cells, judging
-from experiments.cells import Budget, Progress
+from experiments.bookkeeping import Budget
+from experiments.cells import Progress
 from experiments.errors import UserError
 from experiments.presets import Expert, ExpertSettings
 

@@ -1,8 +1,9 @@
 """A whole run: demonstrations, then cell after cell, then the summary and the figures."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import polars as pl
@@ -11,36 +12,26 @@ from rich.console import Console
 from cmedirl_jax import checkpoint, demonstrations, envs, hot_start, seeds
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
-from cmedirl_jax.methods import METHODS, Method
 from experiments import (
     cells,
     experts,
     figures,
     gymnasium_replay,
     judging,
+    planning,
     results,
     statistics,
     tables,
 )
-from experiments.cells import Budget, Programs
+from experiments.bookkeeping import Budget
+from experiments.cells import Programs
 from experiments.errors import UserError
+from experiments.planning import Cell
 from experiments.presets import Grid
 from experiments.progress import Reporter, reporter
 
 FRESH_STARTS = 100
 """Random start states on which each seed's best policy is judged at the end."""
-
-
-class Cell(NamedTuple):
-    """A method and its number of demonstrations; 0 for a method that uses none."""
-
-    method: Method
-    n_demos: int
-
-    @property
-    def name(self) -> str:
-        """The cell's name in paths and progress."""
-        return f"{self.method.name}-n{self.n_demos}" if self.n_demos else self.method.name
 
 
 class Keys(NamedTuple):
@@ -57,134 +48,24 @@ def run(grid: Grid, devices: list[jax.Device], console: Console) -> pl.DataFrame
     Raises:
         UserError: for a configuration, a folder or a file that cannot work.
     """
-    check(grid)
+    planning.check(grid)
     env = envs.make(grid.env)
-    given = None if grid.demos is None else load_demonstrations(grid, env)
+    given = None if grid.demos is None else planning.load_demonstrations(grid, env)
+    new = not grid.folder.exists()
     folder = results.open_folder(grid)
     keys = Keys(*jax.random.split(jax.random.key(grid.seed), 3))
-    plan = cells_of(grid)
+    plan = planning.cells_of(grid)
     done = results.finished(folder)
     todo = [cell for cell in plan if (cell.method.name, cell.n_demos) not in done]
     if todo:
-        _train_cells(grid, env, keys, folder, given, todo, devices, console)
+        try:
+            _train_cells(grid, env, keys, folder, given, todo, devices, console)
+        except UserError:
+            # A refusal (no expert solved the task) leaves nothing behind.
+            if new:
+                shutil.rmtree(folder)
+            raise
     return _conclude(grid, env, folder, plan, redraw=bool(todo))
-
-
-def check(grid: Grid) -> None:
-    """Refuse what can be refused before any work.
-
-    Raises:
-        UserError: naming the option, what is wrong and what would be right.
-    """
-    for method in grid.methods:
-        if method not in METHODS:
-            raise UserError(f"--methods: unknown method {method!r}; there are {', '.join(METHODS)}")
-    try:
-        envs.make(grid.env)
-    except ValueError as error:
-        raise UserError(f"--env: {error}") from error
-    for name in ("methods", "n_demos"):
-        values = getattr(grid, name)
-        if not values or len(set(values)) < len(values):
-            raise UserError(f"--{name.replace('_', '-')}: give one or more, each once")
-    if grid.max_steps is None and grid.max_episodes is None:
-        raise UserError("--max-steps: give a number, or give --max-episodes")
-    if grid.seed < 0:
-        raise UserError(f"--seed: must not be negative, got {grid.seed}")
-    for name, value in _positive(grid):
-        if value is not None and value < 1:
-            raise UserError(f"--{name.replace('_', '-')}: must be at least 1, got {value}")
-
-
-def _positive(grid: Grid) -> list[tuple[str, int | None]]:
-    """Options that must be positive."""
-    settings = grid.settings
-    named = [("n_demos", number) for number in grid.n_demos]
-    named += [
-        (name, getattr(grid, name))
-        for name in (
-            "seeds",
-            "max_steps",
-            "max_episodes",
-            "evaluate_every",
-            "evaluation_starts",
-            "evaluate_every_episodes",
-            "evaluation_starts_episodes",
-            "devices",
-        )
-    ]
-    groups: list[tuple[str, Any, tuple[str, ...]]] = [
-        ("experts", grid.experts, ("seeds", "steps", "trajectories")),
-        (
-            "schedule",
-            settings.schedule,
-            (
-                "batch_size",
-                "replay_capacity",
-                "update_period",
-                "target_period",
-                "behaviour_cloning_steps",
-            ),
-        ),
-        (
-            "reward_schedule",
-            settings.reward_schedule,
-            ("period", "iterations", "anneal_steps", "batch_size", "recent"),
-        ),
-        ("hot_start", settings.hot_start, ("cells", "batch_size")),
-    ]
-    for prefix, options, names in groups:
-        named += [(f"{prefix}.{name}", getattr(options, name)) for name in names]
-    for units in (*settings.architecture.hidden, *settings.reward_schedule.hidden):
-        named.append(("architecture.hidden", units))
-    return named
-
-
-def cells_of(grid: Grid) -> list[Cell]:
-    """The grid's cells; a method without demonstrations has one."""
-    return [
-        Cell(METHODS[name], n_demos)
-        for name in grid.methods
-        for n_demos in (grid.n_demos if METHODS[name].uses_demonstrations else (0,))
-    ]
-
-
-def budget_of(grid: Grid, env: Env) -> Budget:
-    """How long each learner trains."""
-    most = [grid.max_steps]
-    if grid.max_episodes is not None:
-        most.append(grid.max_episodes * env.spec.max_episode_steps)
-    return Budget(
-        max_steps=min(steps for steps in most if steps is not None),
-        max_episodes=grid.max_episodes,
-        evaluate_every=grid.evaluate_every,
-        evaluation_starts=grid.evaluation_starts,
-        evaluate_every_episodes=grid.evaluate_every_episodes,
-        evaluation_starts_episodes=grid.evaluation_starts_episodes,
-    )
-
-
-def load_demonstrations(grid: Grid, env: Env) -> Demonstrations:
-    """The file that `--demos` names.
-
-    Raises:
-        UserError: if it is missing, damaged, foreign, or holds too few.
-    """
-    assert grid.demos is not None
-    try:
-        pool = demonstrations.load(grid.demos, env.spec)
-    except FileNotFoundError as error:
-        raise UserError(f"--demos: there is no file {grid.demos}") from error
-    except (OSError, ValueError) as error:
-        raise UserError(f"--demos: {error}") from error
-    _check_enough(grid, pool)
-    return pool
-
-
-def _check_enough(grid: Grid, pool: Demonstrations) -> None:
-    held = int(pool.episode[-1]) + 1
-    if max(grid.n_demos) > held and any(cell.n_demos for cell in cells_of(grid)):
-        raise UserError(f"--n-demos: {max(grid.n_demos)} asked, the pool holds {held}")
 
 
 def _train_cells(
@@ -197,7 +78,7 @@ def _train_cells(
     devices: list[jax.Device],
     console: Console,
 ) -> None:
-    budget = budget_of(grid, env)
+    budget = planning.budget_of(grid, env)
     pool_path = folder / "demonstrations" / "pool.npz"
     needs_pool = any(cell.n_demos for cell in todo)
     pool = given if given is not None else _reusable(pool_path, grid, env)
@@ -210,11 +91,6 @@ def _train_cells(
     programs: dict[str, Programs] = {}
     with reporter(console, len(todo) + trains_experts, total) as report:
         if trains_experts:
-            if max(grid.n_demos) > grid.experts.trajectories:
-                raise UserError(
-                    f"--n-demos: {max(grid.n_demos)} asked, the pool will hold "
-                    f"{grid.experts.trajectories}; raise --experts.trajectories"
-                )
             report.start("experts")
             pool = experts.make_pool(
                 keys.experts,
@@ -226,7 +102,7 @@ def _train_cells(
             )
         if needs_pool:
             assert pool is not None
-            _check_enough(grid, pool)
+            planning.check_enough(grid, int(pool.episode[-1]) + 1)
             if not pool_path.exists():
                 pool_path.parent.mkdir(exist_ok=True)
                 demonstrations.save(pool_path, pool)

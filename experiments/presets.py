@@ -9,7 +9,8 @@ import tyro
 from cmedirl_jax.ddpg import DDPGHParams
 from cmedirl_jax.hot_start import HotStartHParams
 from cmedirl_jax.irl import IRLHParams
-from cmedirl_jax.methods import METHODS, ExplorationSettings, RewardSchedule, Schedule, Settings
+from cmedirl_jax.methods import METHODS, ExplorationSettings, Settings
+from cmedirl_jax.schedules import RewardSchedule, Schedule
 
 Expert = Literal["best", "median", "all"]
 

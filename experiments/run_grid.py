@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments import grid as grid_lib
+from experiments import planning
 from experiments.errors import UserError
 from experiments.presets import PRESETS, Grid
 
@@ -25,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not console.is_terminal:
         console = Console(width=120)
     try:
-        grid_lib.check(grid)
+        planning.check(grid)
         devices = start_devices(grid)
         summary = grid_lib.run(grid, devices, console)
     except UserError as error:

@@ -1,8 +1,9 @@
 """From the tables of a run to one row per cell, with intervals.
 
 Every interval is a 95% one over seeds: Clopper-Pearson for shares, order statistics for medians, a
-percentile bootstrap for means. A seed that never reached the threshold, or diverged, counts as
-+infinity in a median; it is never dropped.
+percentile bootstrap for means. A seed that never reached the threshold counts as +infinity in a
+median; it is never dropped. A seed that diverged is judged by its evaluations until then, and does
+not count as sustained.
 """
 
 from typing import Any, NamedTuple
@@ -149,6 +150,7 @@ def summarise(
     dips = columns.dip_fraction[~np.isnan(columns.dip_fraction)]
     after = columns.return_after_convergence[converged]
     best = seeds["best_return"].to_numpy()
+    diverged = seeds["diverged"].to_numpy()
     row: dict[str, Any] = {
         **{name: first[name] for name in ("expert", "method", "n_demos")},
         "seeds": len(found),
@@ -166,7 +168,7 @@ def summarise(
         if comparable and restricted.size > 1
         else None,
         "convergence_episode_restricted": not bool(converged.all()),
-        **_named("sustained_fraction", share(columns.sustained.astype(bool))),
+        **_named("sustained_fraction", share(columns.sustained.astype(bool) & ~diverged)),
         **(_named("dip_fraction", mean(dips)) if dips.size else _empty("dip_fraction")),
         **_named("area", mean(columns.area)),
         "final_return_mean": float(columns.final_return.mean()),
@@ -185,7 +187,7 @@ def summarise(
         "env_steps_learner": int(seeds["env_steps"].sum()),
         "env_steps_demonstrations": int(seeds["demonstration_steps"].sum()),
         "env_steps_expert": int(seeds["expert_steps"][0]),
-        "diverged": int(seeds["diverged"].sum()),
+        "diverged": int(diverged.sum()),
         "gymnasium_return_mean": float(seeds["gymnasium_return"].mean()),
         "gymnasium_difference_max": float(seeds["gymnasium_difference"].max()),
     }

@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 from typing import Any, NamedTuple
 
 import jax
@@ -6,20 +7,22 @@ import numpy as np
 import pytest
 
 from cmedirl_jax.ddpg import DDPGHParams
-from cmedirl_jax.methods import METHODS, Schedule, Settings
+from cmedirl_jax.methods import METHODS, Settings
 from cmedirl_jax.networks import Architecture
+from cmedirl_jax.schedules import Schedule
 from cmedirl_jax.training import Log
 from experiments import cells, judging
-from experiments.cells import Budget, CellResult, Progress
+from experiments.bookkeeping import Budget
+from experiments.cells import CellResult, Progress
 
 SEEDS = 3
 STARTS, STARTS_BY_EPISODES = 5, 7
 LEARNING_STARTS = 20
 LIMIT = 25
-BY_STEPS = Budget(120, None, 50, STARTS)
-BY_STEPS_IN_TWO = Budget(120, None, 100, STARTS)
+CHUNK = 25
+"""Divides every budget below: calls of one length compile once."""
+BY_STEPS = Budget(125, None, 50, STARTS)
 BY_EPISODES = Budget(6 * LIMIT, 6, 50, STARTS, 2, STARTS_BY_EPISODES)
-KEY = jax.random.key(5)
 
 
 class Chunk(NamedTuple):
@@ -41,7 +44,9 @@ class Trained(NamedTuple):
 @pytest.fixture(scope="module")
 def programs(env):
     """Linear DDPG where episodes of 25 steps start near the goal, so that some reach it."""
-    params = env.default_params.replace(max_episode_steps=LIMIT, start_low=0.35, start_high=0.44, power=0.004)
+    params = env.default_params.replace(
+        max_episode_steps=LIMIT, start_low=0.35, start_high=0.44, power=0.004
+    )
     spec = env.spec._replace(max_episode_steps=LIMIT)
     short = env._replace(spec=spec, default_params=params)
     settings = Settings(
@@ -72,16 +77,18 @@ def train(programs, budget, *, threshold=0.0, before_chunk=lambda state, first_s
         chunks.append(jax.tree.map(np.array, Chunk(steps, log, state.agent.actor)))
         return state, log
 
-    result = cells.train(
-        programs._replace(run=run),
-        KEY,
-        None,
-        0,
-        seeds_count=SEEDS,
-        budget=budget,
-        threshold=threshold,
-        report=reports.append,
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cells, "CHUNK", CHUNK)
+        result = cells.train(
+            programs._replace(run=run),
+            jax.random.key(5),
+            None,
+            0,
+            seeds_count=SEEDS,
+            budget=budget,
+            threshold=threshold,
+            report=reports.append,
+        )
     return Trained(result, chunks, reports)
 
 
@@ -95,10 +102,20 @@ def by_episodes(programs):
     return train(programs, BY_EPISODES)
 
 
+class Row(NamedTuple):
+    """One seed's evaluation."""
+
+    seed: int
+    env_step: int
+    episode: int
+    return_mean: float
+    q_mean: float
+    critic_loss: float
+
+
 def evaluation_rows(result, protocol="steps", seed=None):
-    """Every evaluation as `(seed, env_step, episode, return_mean, q_mean, critic_loss)`."""
     return [
-        row
+        Row(*row)
         for found in result.evaluations
         if found.protocol == protocol
         for row in zip(
@@ -118,6 +135,12 @@ def episode_rows(result, seed=None):
     """Every finished episode as `(seed, episode, env_step, return, length, terminated)`."""
     rows = zip(*result.episodes, strict=True)
     return sorted(row for row in rows if seed is None or row[0] == seed)
+
+
+def whole_log(trained):
+    """The log of all chunks, leaves `[seeds, steps]`."""
+    logs = [chunk.log for chunk in trained.chunks]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *logs)
 
 
 def actor_of(actors, seed):
@@ -144,35 +167,37 @@ def test_every_seed_is_first_evaluated_at_step_0_before_any_update(by_steps):
 
 def test_evaluations_come_at_the_multiples_and_at_the_end(by_steps):
     for seed in range(SEEDS):
-        steps = [row[1] for row in evaluation_rows(by_steps.result, seed=seed)]
-        assert steps == [0, 50, 100, 120]
+        steps = [row.env_step for row in evaluation_rows(by_steps.result, seed=seed)]
+        assert steps == [0, 50, 100, 125]
 
 
 def test_an_evaluation_is_of_the_policy_at_that_step(by_steps, programs):
-    for found, chunk in zip(by_steps.result.evaluations[1:], by_steps.chunks, strict=True):
-        expected = mean_return(programs, chunk.actor, STARTS)[:SEEDS]
+    actors = {chunk.steps[-1] + 1: chunk.actor for chunk in by_steps.chunks}
+    for found in by_steps.result.evaluations[1:]:
+        expected = mean_return(programs, actors[found.env_step[0]], STARTS)[:SEEDS]
         np.testing.assert_array_equal(found.evaluation.return_mean, expected)
 
 
-def test_q_mean_and_critic_loss_are_means_over_the_updates_since_the_last_evaluation(by_steps):
-    for found, chunk in zip(by_steps.result.evaluations[1:], by_steps.chunks, strict=True):
-        updates = chunk.steps >= LEARNING_STARTS
-        for column in ("q_mean", "critic_loss"):
-            expected = getattr(chunk.log, column)[:SEEDS, updates].mean(axis=1)
-            np.testing.assert_allclose(getattr(found, column), expected, rtol=1e-5)
+def test_q_mean_and_critic_loss_are_means_over_the_updates_since_the_last_evaluation(
+    by_steps, by_episodes
+):
+    for run in (by_steps, by_episodes):
+        log = whole_log(run)
+        for seed in range(SEEDS):
+            for before, row in itertools.pairwise(evaluation_rows(run.result, seed=seed)):
+                updates = slice(max(before.env_step, LEARNING_STARTS), row.env_step)
+                expected = log.q_mean[seed, updates].mean(), log.critic_loss[seed, updates].mean()
+                np.testing.assert_allclose(row[-2:], expected, rtol=1e-5)
 
 
 def test_episodes_are_those_of_the_log(by_steps):
+    log = whole_log(by_steps)
     expected = []
     for seed in range(SEEDS):
-        number = 0
-        for chunk in by_steps.chunks:
-            for index, step in enumerate(chunk.steps):
-                if chunk.log.done[seed, index]:
-                    number += 1
-                    columns = ("episode_return", "episode_length", "terminated")
-                    logged = [getattr(chunk.log, name)[seed, index] for name in columns]
-                    expected.append((seed, number, step + 1, *logged))
+        (ends,) = np.nonzero(log.done[seed])
+        for number, end in enumerate(ends, start=1):
+            columns = (log.episode_return, log.episode_length, log.terminated)
+            expected.append((seed, number, end + 1, *(column[seed, end] for column in columns)))
     assert episode_rows(by_steps.result) == expected
 
 
@@ -194,8 +219,9 @@ def test_episodes_follow_each_other_without_gaps(run, request):
 
 
 def test_an_evaluation_counts_the_episodes_finished_by_then(by_steps):
-    for seed, env_step, episode, *_ in evaluation_rows(by_steps.result):
-        assert episode == sum(row[2] <= env_step for row in episode_rows(by_steps.result, seed))
+    for row in evaluation_rows(by_steps.result):
+        ends = [end for _, _, end, *_ in episode_rows(by_steps.result, row.seed)]
+        assert row.episode == sum(end <= row.env_step for end in ends)
 
 
 def test_a_cell_by_steps_ends_after_all_its_steps(by_steps):
@@ -211,78 +237,61 @@ def test_a_cell_by_steps_ends_after_all_its_steps(by_steps):
 @pytest.mark.parametrize("run", ["by_steps", "by_episodes"])
 def test_the_best_policy_returns_each_seeds_highest_evaluation(run, request, programs):
     result = request.getfixturevalue(run).result
-    highest = [max(row[3] for row in evaluation_rows(result, seed=seed)) for seed in range(SEEDS)]
+    highest = [
+        max(row.return_mean for row in evaluation_rows(result, seed=seed)) for seed in range(SEEDS)
+    ]
     np.testing.assert_array_equal(mean_return(programs, result.best, STARTS), highest)
 
 
 def test_reports_follow_the_steps_and_the_share_of_seeds_at_the_threshold(programs, by_steps):
     returns = [found.evaluation.return_mean for found in by_steps.result.evaluations]
     threshold = float(np.median(returns))
-    expected = [
-        Progress(step, np.mean(at_step >= threshold))
-        for step, at_step in zip((0, 50, 100, 120), returns, strict=True)
-    ]
-    assert train(programs, BY_STEPS, threshold=threshold).reports == expected
-
-
-def test_the_size_of_the_chunks_changes_nothing_but_the_reports(programs, by_steps, monkeypatch):
-    monkeypatch.setattr(cells, "CHUNK", 50)
-    chunked = train(programs, BY_STEPS_IN_TWO)
-    assert [report.env_step for report in chunked.reports] == [0, 50, 100, 120]
-    assert episode_rows(chunked.result) == episode_rows(by_steps.result)
-    for seed in range(SEEDS):
-        rows = evaluation_rows(chunked.result, seed=seed)
-        assert [row[1] for row in rows] == [0, 100, 120]
-        assert rows[2] == evaluation_rows(by_steps.result, seed=seed)[3]
-        _, fifty, hundred, _ = evaluation_rows(by_steps.result, seed=seed)
-        assert rows[1][:4] == hundred[:4]
-        updates = np.array([50 - LEARNING_STARTS, 50])
-        for column in (4, 5):
-            pooled = np.dot(updates, (fifty[column], hundred[column])) / updates.sum()
-            np.testing.assert_allclose(rows[1][column], pooled, rtol=1e-6)
+    first, second, third, last = (np.mean(values >= threshold) for values in returns)
+    expected = zip(range(0, 126, CHUNK), (first, first, second, second, third, last), strict=True)
+    reports = train(programs, BY_STEPS, threshold=threshold).reports
+    assert reports == [Progress(*report) for report in expected]
 
 
 def test_each_seed_ends_with_its_last_episode(by_episodes):
     result = by_episodes.result
-    for seed in range(SEEDS):
+    for seed, end in enumerate(result.env_steps):
         rows = episode_rows(result, seed)
-        end = rows[-1][2]
         assert len(rows) == BY_EPISODES.max_episodes
-        assert result.env_steps[seed] == end
+        assert rows[-1][2] == end
         assert evaluation_rows(result, seed=seed)[-1][1:3] == (end, BY_EPISODES.max_episodes)
     assert len(set(result.env_steps)) > 1
 
 
-def test_a_seed_that_has_ended_is_evaluated_once_more_and_learns_no_more(by_episodes):
+def test_a_seed_that_has_ended_is_evaluated_once_more(by_episodes):
     result = by_episodes.result
-    for seed in range(SEEDS):
-        end = result.env_steps[seed]
-        steps = [row[1] for row in evaluation_rows(result, seed=seed)]
+    for seed, end in enumerate(result.env_steps):
+        steps = [row.env_step for row in evaluation_rows(result, seed=seed)]
         assert steps == [*range(0, end, BY_EPISODES.evaluate_every), end]
-        for chunk in by_episodes.chunks:
-            if chunk.steps[-1] >= end - 1:
-                assert_same(actor_of(chunk.actor, seed), actor_of(result.final, seed))
+
+
+def test_a_seed_that_has_ended_learns_no_more(by_episodes):
+    result = by_episodes.result
+    after_the_end = [
+        (seed, chunk)
+        for seed, end in enumerate(result.env_steps)
+        for chunk in by_episodes.chunks
+        if chunk.steps[-1] + 1 >= end
+    ]
+    assert len(after_the_end) > SEEDS
+    for seed, chunk in after_the_end:
+        assert_same(actor_of(chunk.actor, seed), actor_of(result.final, seed))
 
 
 def test_an_ended_seeds_last_evaluation_is_of_its_final_policy(by_episodes, programs):
-    last = [evaluation_rows(by_episodes.result, seed=seed)[-1][3] for seed in range(SEEDS)]
+    last = [evaluation_rows(by_episodes.result, seed=seed)[-1].return_mean for seed in range(SEEDS)]
     np.testing.assert_array_equal(mean_return(programs, by_episodes.result.final, STARTS), last)
 
 
-def test_updates_after_a_seeds_end_do_not_count(by_episodes):
-    for seed in range(SEEDS):
-        end = by_episodes.result.env_steps[seed]
-        (chunk,) = (c for c in by_episodes.chunks if c.steps[0] < end <= c.steps[-1] + 1)
-        before = (chunk.steps >= LEARNING_STARTS) & (chunk.steps < end)
-        q_mean = evaluation_rows(by_episodes.result, seed=seed)[-1][4]
-        np.testing.assert_allclose(q_mean, chunk.log.q_mean[seed, before].mean(), rtol=1e-5)
-
-
 def test_a_cell_ends_by_steps_or_by_episodes_whichever_comes_first(programs, by_episodes):
-    ends = by_episodes.result.env_steps
-    steps = int(np.sort(ends)[1]) // 50 * 50
-    result = train(programs, dataclasses.replace(BY_EPISODES, max_steps=steps)).result
-    np.testing.assert_array_equal(result.env_steps, np.minimum(ends, steps))
+    result = train(programs, dataclasses.replace(BY_EPISODES, max_steps=75, max_episodes=4)).result
+    fourth = [episode_rows(by_episodes.result, seed)[3][2] for seed in range(SEEDS)]
+    assert min(fourth) < 75 < max(fourth)
+    np.testing.assert_array_equal(result.env_steps, np.minimum(fourth, 75))
 
 
 def test_evaluations_by_episodes_come_with_the_chunk_that_passes_another_multiple(
@@ -321,7 +330,7 @@ def diverge_at(step, *which):
 def test_a_diverged_seed_is_marked_and_the_others_do_not_notice(programs, by_steps):
     result = train(programs, BY_STEPS, before_chunk=diverge_at(50, 1)).result
     np.testing.assert_array_equal(result.diverged, [False, True, False])
-    np.testing.assert_array_equal(result.env_steps, [120, 100, 120])
+    np.testing.assert_array_equal(result.env_steps, [125, 50, 125])
     for seed in (0, 2):
         np.testing.assert_array_equal(
             evaluation_rows(result, seed=seed), evaluation_rows(by_steps.result, seed=seed)
@@ -330,18 +339,19 @@ def test_a_diverged_seed_is_marked_and_the_others_do_not_notice(programs, by_ste
         assert_same(actor_of(result.best, seed), actor_of(by_steps.result.best, seed))
 
 
-def test_a_diverged_seed_gets_no_further_rows_and_keeps_its_best_policy(programs, by_steps):
+def test_a_diverged_seed_keeps_what_came_before_the_chunk_and_its_best_policy(programs, by_steps):
     result = train(programs, BY_STEPS, before_chunk=diverge_at(50, 1)).result
     np.testing.assert_array_equal(
         evaluation_rows(result, seed=1), evaluation_rows(by_steps.result, seed=1)[:2]
     )
-    assert all(row[2] <= 100 for row in episode_rows(result, 1))
-    highest = max(row[3] for row in evaluation_rows(result, seed=1))
+    before = [row for row in episode_rows(by_steps.result, 1) if row[2] <= 50]
+    assert episode_rows(result, 1) == before
+    highest = max(row.return_mean for row in evaluation_rows(result, seed=1))
     assert mean_return(programs, result.best, STARTS)[1] == highest
 
 
 def test_a_cell_ends_when_every_seed_has_diverged(programs):
     trained = train(programs, BY_STEPS, before_chunk=diverge_at(0, *range(SEEDS)))
     assert trained.result.diverged.all()
-    assert [report.env_step for report in trained.reports] == [0, 50]
+    assert [report.env_step for report in trained.reports] == [0, 25]
     assert len(trained.result.evaluations) == 1

@@ -102,10 +102,16 @@ def test_what_is_no_checkpoint_is_not_found(tmp_path, kind, like):
         STATE.replace(reward=jnp.zeros(())),
         STATE.replace(step=None),
         STATE.replace(moments=STATE.moments._replace(second=jnp.zeros(3))),
-        STATE.replace(step=jnp.zeros(3, jnp.int32)),
     ],
-    ids=["part", "fewer", "more", "none", "deeper", "shape"],
+    ids=["part", "fewer", "more", "none", "deeper"],
 )
 def test_another_structure_is_refused(path, like):
     with pytest.raises(ValueError, match=str(path)):
         checkpoint.load(path, like)
+
+
+@pytest.mark.parametrize("shape", [(2,), (5,), (3, 1), ()])
+def test_another_shape_is_refused(tmp_path, shape):
+    checkpoint.save(tmp_path / "leaf", {"leaf": jnp.zeros(3)})
+    with pytest.raises(ValueError, match="shape"):
+        checkpoint.load(tmp_path / "leaf", {"leaf": jnp.zeros(shape)})

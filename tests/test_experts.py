@@ -9,7 +9,8 @@ import pytest
 from cmedirl_jax import demonstrations
 from cmedirl_jax.evaluation import Evaluation
 from experiments import experts
-from experiments.cells import CellResult, EvaluationRows
+from experiments.bookkeeping import EvaluationRows
+from experiments.cells import CellResult
 from experiments.errors import UserError
 from experiments.presets import ExpertSettings
 

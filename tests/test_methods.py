@@ -3,7 +3,8 @@ import dataclasses
 import pytest
 
 from cmedirl_jax import envs, methods
-from cmedirl_jax.methods import METHODS, ExplorationSettings, Schedule, Settings
+from cmedirl_jax.methods import METHODS, ExplorationSettings, Settings
+from cmedirl_jax.schedules import Schedule
 
 SPEC = envs.make("MountainCarContinuous-v0").spec
 

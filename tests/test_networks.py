@@ -106,6 +106,16 @@ def test_critic_is_the_perceptron(skewed_spec, normalisation, action_layer, lead
     np.testing.assert_allclose(output, expected[..., 0], rtol=1e-4, atol=1e-4)
 
 
+def test_layer_normalisation_adds_1e_5_to_the_variance(skewed_spec):
+    critic = networks.make(skewed_spec, Architecture(hidden=(8,))).critic
+    variables = jax.tree.map(lambda leaf: 0.003 * leaf, randomised(critic.init(KEY)))
+    observation, action = inputs(skewed_spec, 5)
+    x = scaled(skewed_spec, observation)
+    expected, _ = reference(float64(variables), x, action, normalisation="layer")
+    output = critic.apply(variables, observation, action)
+    np.testing.assert_allclose(output, expected[:, 0], rtol=1e-3)
+
+
 def test_training_normalises_by_the_batch_and_moves_the_running_statistics(skewed_spec):
     architecture = Architecture(hidden=(8, 6), critic_normalisation="batch", action_layer=1)
     critic = networks.make(skewed_spec, architecture).critic

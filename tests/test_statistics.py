@@ -250,10 +250,12 @@ def test_diverged_seeds_are_counted_and_kept():
     assert row["converged_fraction"] == 0.5
 
 
-@pytest.mark.xfail(strict=True, reason="summarise does not look at `diverged`")
-def test_a_seed_that_diverged_after_it_converged_counts_as_never():
+def test_a_seed_that_diverged_after_it_converged_is_not_sustained():
     row = statistics.summarise(
-        evaluations_of([95]), seeds_of(1, diverged=[True]), 90.0, episodes_bind=False
+        evaluations_of([95, 95], [95]),
+        seeds_of(2, diverged=[False, True]),
+        90.0,
+        episodes_bind=False,
     )
-    assert row["convergence_env_step_median"] is None
-    assert row["sustained_fraction"] == 0.0
+    assert row["converged_fraction"] == 1.0
+    assert row["sustained_fraction"] == 0.5

@@ -9,8 +9,9 @@ import pytest
 
 from cmedirl_jax import hot_start, replay, seeds, training
 from cmedirl_jax.hot_start import HotStartHParams
-from cmedirl_jax.methods import METHODS, RewardSchedule, Schedule, Settings
+from cmedirl_jax.methods import METHODS, Settings
 from cmedirl_jax.networks import Architecture
+from cmedirl_jax.schedules import RewardSchedule, Schedule
 from tests import pools
 
 LIMIT = 40

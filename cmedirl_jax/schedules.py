@@ -1,0 +1,95 @@
+"""What each environment step does: learn, move the targets, learn the reward, and how much.
+
+All of it follows from the step's number alone, which all seeds share. So the predicates are not
+batched under `vmap`, and `lax.cond` on them stays a branch.
+"""
+
+import dataclasses
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+@dataclasses.dataclass(frozen=True)
+class RewardSchedule:
+    """When the reward is learned, and from what."""
+
+    period: int = 4
+    """Environment steps between updates of the reward."""
+    iterations: int = 1
+    """Iterations K of Algorithm 1 at each update."""
+    stop: int | None = 2000
+    """Environment step from which r_D is frozen (and kept); None: never."""
+    anneal_steps: int | None = None
+    """Environment steps over which the weight of r_D falls linearly to 0; None: stays 1."""
+    batch_size: int = 32
+    """Demonstrated pairs per update, and background pairs per update."""
+    recent: int | None = 2000
+    """Background: the latest transitions of the replay; None: all collected so far."""
+    storage: Literal["recompute", "store"] = "recompute"
+    """Compute r_D anew when a transition is sampled, or store r* = r_D + r_e at collection."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of each hidden layer of the reward network."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """The training loop."""
+
+    batch_size: int = 32
+    """Transitions per update."""
+    replay_capacity: int | None = None
+    """Transitions the replay holds; None: every one of the run."""
+    learning_starts: int = 200
+    """Environment steps before the first update."""
+    update_period: int = 1
+    """Environment steps between updates of actor and critic."""
+    target_period: int = 1
+    """Environment steps between target updates (the paper: 300, with agent.tau 1)."""
+    behaviour_cloning_steps: int = 4000
+    """Environment steps over which agent.behaviour_cloning falls linearly to 0."""
+
+
+class Plan(NamedTuple):
+    """What a step does, all `[]`.
+
+    Attributes:
+        step: its number.
+        learn: update actor and critic.
+        update_targets: move the targets at that update.
+        learn_reward: update the learned reward.
+        reward_weight: weight of r_D beside r_e.
+        cloning_weight: factor on the behaviour-cloning term.
+    """
+
+    step: jax.Array
+    learn: jax.Array
+    update_targets: jax.Array
+    learn_reward: jax.Array
+    reward_weight: jax.Array
+    cloning_weight: jax.Array
+
+
+def plan(step: jax.Array, schedule: Schedule, reward_schedule: RewardSchedule) -> Plan:
+    """What environment step `step` (`[]` int32) does."""
+    learns = step >= schedule.learning_starts
+    learn_reward = learns & (step % reward_schedule.period == 0)
+    if reward_schedule.stop is not None:
+        learn_reward &= step < reward_schedule.stop
+    reward_weight = jnp.ones_like(step, jnp.float32)
+    if reward_schedule.anneal_steps is not None:
+        reward_weight = _falling(step, reward_schedule.anneal_steps)
+    return Plan(
+        step=step,
+        learn=learns & (step % schedule.update_period == 0),
+        update_targets=step % schedule.target_period == 0,
+        learn_reward=learn_reward,
+        reward_weight=reward_weight,
+        cloning_weight=_falling(step, schedule.behaviour_cloning_steps),
+    )
+
+
+def _falling(step: jax.Array, steps: int) -> jax.Array:
+    """From 1 at step 0 to 0 at `steps`, linearly."""
+    return jnp.maximum(1.0 - step / steps, 0.0)

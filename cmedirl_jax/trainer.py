@@ -1,0 +1,295 @@
+"""Algorithm 2 for one seed, as functions that vmap over seeds.
+
+    trainer = training.make(env, METHODS["hs-me-ddpg"], Settings(), capacity=12_000)
+    states = jax.vmap(trainer.init, in_axes=(0, None, None))(keys, data, 200)
+    states, log = jax.jit(jax.vmap(trainer.run, in_axes=(0, None, 0)))(states, data, steps)
+
+Every step's randomness is drawn from `fold_in(seed's key, step)`, so that what a seed does depends
+neither on how many seeds run beside it nor on how its steps are cut into chunks.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from cmedirl_jax import demonstrations as demonstrations_lib
+from cmedirl_jax import hot_start, methods, schedules, updates
+from cmedirl_jax.ddpg import DDPGState
+from cmedirl_jax.demonstrations import DemonstrationSubset
+from cmedirl_jax.envs import Env
+from cmedirl_jax.hot_start import HotStartData
+from cmedirl_jax.irl import RewardState
+from cmedirl_jax.methods import Algorithm, Method, Settings
+from cmedirl_jax.replay import ReplayState
+from cmedirl_jax.schedules import Plan
+from cmedirl_jax.types import Numeric, Transition
+from cmedirl_jax.updates import Draws
+
+
+class TrainingState(flax.struct.PyTreeNode):
+    """One seed.
+
+    Attributes:
+        key: the seed's own key; never advanced, steps fold into it.
+        agent: DDPG's state.
+        reward: the learned reward's state, or None.
+        storage: `[capacity, D]`, the replay's rows; its count is the number of steps taken.
+        exploration: the behaviour policy's state.
+        env: the environment's state.
+        observation: `[O]`, the current one.
+        episode: `[]` int32, finished episodes.
+        episode_return: `[]`, of the running episode.
+        episode_length: `[]` int32, of the running episode.
+        subset: the seed's own demonstrations, or None.
+    """
+
+    key: jax.Array
+    agent: DDPGState
+    reward: RewardState | None
+    storage: jax.Array
+    exploration: Any
+    env: Any
+    observation: jax.Array
+    episode: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+    subset: DemonstrationSubset | None
+
+
+class Log(NamedTuple):
+    """What each of `T` steps did, leaves `[T]`.
+
+    Attributes:
+        done: an episode ended at this step (and the seed was still running).
+        terminated: it ended at the goal rather than by the time limit.
+        episode_return: undiscounted return of the episode so far, the environment's reward alone.
+        episode_length: steps of the episode so far.
+        learned: actor and critic were updated at this step.
+        critic_loss: of that update, else 0.
+        q_mean: of that update, else 0.
+    """
+
+    done: jax.Array
+    terminated: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+    learned: jax.Array
+    critic_loss: jax.Array
+    q_mean: jax.Array
+
+
+class Trainer(NamedTuple):
+    """A method on an environment as pure functions of one seed.
+
+    Attributes:
+        algorithm: the method's parts.
+        init: `(key, data, n_demonstrations) -> TrainingState`, hot start included. `data` is what
+            `hot_start.data` made of the pool, or None for methods without demonstrations.
+        run: `(state, data, steps, max_episodes=None) -> (TrainingState, Log)` for `steps` `[T]`
+            int32, the numbers t, t + 1, ... of the environment steps to take. Under vmap leave
+            `data`, `steps` and `max_episodes` unbatched: branches are taken by them. A seed that
+            has finished `max_episodes` episodes learns no more.
+        act: `(actor parameters, observation [..., O]) -> action [..., A]`, mu(s).
+    """
+
+    algorithm: Algorithm
+    init: Callable[..., TrainingState]
+    run: Callable[..., tuple[TrainingState, Log]]
+    act: Callable[..., jax.Array]
+
+
+class _Draws(NamedTuple):
+    """All randomness of a step."""
+
+    env: jax.Array
+    reset: jax.Array
+    noise: Any
+    updates: Draws
+
+
+def make(
+    env: Env,
+    method: Method,
+    settings: Settings | None = None,
+    *,
+    capacity: int,
+    env_params: Any = None,
+    subset_size: int | None = None,
+) -> Trainer:
+    """Make a trainer.
+
+    Args:
+        env: the environment.
+        method: one of `METHODS`, or your own.
+        settings: every other choice.
+        capacity: transitions in the replay where `settings.schedule` leaves it open.
+        env_params: default `env.default_params`.
+        subset_size: pad each seed's subset to this many demonstrations, so that their number may be
+            traced: one program for every number of demonstrations.
+    """
+    settings = settings or Settings()
+    env_params = env.default_params if env_params is None else env_params
+    algorithm = methods.compose(env.spec, method, settings, capacity)
+    agent, learner, exploration, replay = algorithm
+    update = updates.make(algorithm, method, settings)
+
+    def init(key: jax.Array, data: HotStartData | None, n_demonstrations: Numeric) -> TrainingState:
+        agent_key, fit_key, reward_key, env_key, noise_key, subset_key = jax.random.split(key, 6)
+        state = agent.init(agent_key)
+        subset = None
+        if method.uses_demonstrations:
+            if data is None:
+                raise ValueError(f"{method.name} needs demonstrations")
+            subset = demonstrations_lib.subset(
+                subset_key, data.episodes, n_demonstrations, subset_size
+            )
+        if method.hot_start:
+            params = hot_start.fit(
+                fit_key,
+                agent.networks,
+                (state.actor, state.critic),
+                data,  # type: ignore[arg-type]
+                settings.hot_start,
+                subset=subset,
+            )
+            state = agent.init(agent_key, params)
+        env_state, observation = env.reset(env_key, env_params)
+        return TrainingState(
+            key=key,
+            agent=state,
+            reward=learner.init(reward_key) if learner else None,
+            storage=replay.init().storage,
+            exploration=exploration.init(noise_key),
+            env=env_state,
+            observation=observation,
+            episode=jnp.zeros((), jnp.int32),
+            episode_return=jnp.zeros(()),
+            episode_length=jnp.zeros((), jnp.int32),
+            subset=subset,
+        )
+
+    def draw(key: jax.Array, subset: DemonstrationSubset | None, step: jax.Array) -> _Draws:
+        keys = jax.random.split(jax.random.fold_in(key, step), 4)
+        return _Draws(
+            env=keys[0],
+            reset=keys[1],
+            noise=exploration.draw(keys[2]),
+            updates=update.draw(keys[3], subset),
+        )
+
+    def advance(
+        state: TrainingState,
+        pool: Transition | None,
+        draws: _Draws,
+        now: Plan,
+        max_episodes: jax.Array | None,
+    ) -> tuple[TrainingState, Log]:
+        greedy = agent.act(state.agent, state.observation)
+        action, _, exploration_state = exploration.perturb(
+            state.exploration, greedy, draws.noise, now.step
+        )
+        env_state, step = env.step(draws.env, state.env, action, env_params)
+        transition = Transition(
+            state.observation, action, step.reward, step.observation, step.terminated
+        )
+        replay_state = replay.add(
+            ReplayState(state.storage, now.step), update.collect(state.reward, transition, now)
+        )
+
+        reward_state = state.reward
+        if learner is not None:
+            reward_state = jax.lax.cond(
+                now.learn_reward,
+                lambda reward: update.update_reward(reward, pool, replay_state, draws.updates),  # type: ignore[arg-type]
+                lambda reward: reward,
+                reward_state,
+            )
+
+        def learn(agent_state: DDPGState):
+            agent_state, info = update.update_agent(
+                agent_state, reward_state, pool, replay_state, draws.updates, now
+            )
+            return agent_state, info.critic_loss, info.q_mean
+
+        agent_state, critic_loss, q_mean = jax.lax.cond(
+            now.learn,
+            learn,
+            lambda agent_state: (agent_state, jnp.zeros(()), jnp.zeros(())),
+            state.agent,
+        )
+
+        done = step.terminated | step.truncated
+        log = Log(
+            done=done if max_episodes is None else done & (state.episode < max_episodes),
+            terminated=step.terminated,
+            episode_return=state.episode_return + step.reward,
+            episode_length=state.episode_length + 1,
+            learned=now.learn,
+            critic_loss=critic_loss,
+            q_mean=q_mean,
+        )
+        fresh_env, fresh_observation = env.reset(draws.reset, env_params)
+        state = state.replace(
+            agent=agent_state,
+            reward=reward_state,
+            storage=replay_state.storage,
+            exploration=_select(done, exploration.reset(exploration_state), exploration_state),
+            env=_select(done, fresh_env, env_state),
+            observation=_select(done, fresh_observation, step.observation),
+            episode=state.episode + log.done,
+            episode_return=jnp.where(done, 0.0, log.episode_return),
+            episode_length=jnp.where(done, 0, log.episode_length),
+        )
+        if max_episodes is not None:
+            state = _stop_learning(state, state.episode >= max_episodes)
+        return state, log
+
+    def run(
+        state: TrainingState,
+        data: HotStartData | None,
+        steps: jax.Array,
+        max_episodes: Numeric | None = None,
+    ) -> tuple[TrainingState, Log]:
+        pool = None if data is None else data.transition
+        # Hashing a chunk's randomness in one go costs a tenth of hashing it step by step.
+        draws = jax.vmap(draw, in_axes=(None, None, 0))(state.key, state.subset, steps)
+
+        def body(state: TrainingState, inputs: tuple[_Draws, Plan]):
+            return advance(state, pool, *inputs, max_episodes)  # type: ignore[arg-type]
+
+        plans = jax.vmap(
+            lambda step: schedules.plan(step, settings.schedule, settings.reward_schedule)
+        )(steps)
+        return jax.lax.scan(body, state, (draws, plans))
+
+    def act(params: Any, observation: jax.Array) -> jax.Array:
+        networks = agent.networks
+        return networks.squash(networks.actor.apply(params, observation))
+
+    return Trainer(algorithm, init, run, act)
+
+
+def _select(predicate: jax.Array, on_true: Any, on_false: Any) -> Any:
+    return jax.tree.map(lambda x, y: jnp.where(predicate, x, y), on_true, on_false)
+
+
+def _stop_learning(state: TrainingState, stopped: jax.Array) -> TrainingState:
+    """Set a stopped seed's learning rates to zero: cheaper than a select over every parameter."""
+    goes_on = 1.0 - stopped.astype(jnp.float32)
+    hparams = state.agent.hparams
+    agent = state.agent.replace(
+        hparams=hparams.replace(
+            actor_learning_rate=hparams.actor_learning_rate * goes_on,
+            critic_learning_rate=hparams.critic_learning_rate * goes_on,
+        )
+    )
+    if state.reward is None:
+        return state.replace(agent=agent)
+    hparams = state.reward.hparams
+    reward = state.reward.replace(
+        hparams=hparams.replace(learning_rate=hparams.learning_rate * goes_on)
+    )
+    return state.replace(agent=agent, reward=reward)

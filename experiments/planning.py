@@ -1,0 +1,147 @@
+"""What a run will do, and whether it can: cells, budget, and every refusal before any work."""
+
+from typing import Any, NamedTuple
+
+from cmedirl_jax import demonstrations, envs
+from cmedirl_jax.demonstrations import Demonstrations
+from cmedirl_jax.envs import Env
+from cmedirl_jax.methods import METHODS, Method
+from experiments.bookkeeping import Budget
+from experiments.errors import UserError
+from experiments.presets import Grid
+
+
+class Cell(NamedTuple):
+    """A method and its number of demonstrations; 0 for a method that uses none."""
+
+    method: Method
+    n_demos: int
+
+    @property
+    def name(self) -> str:
+        """The cell's name in paths and progress."""
+        return f"{self.method.name}-n{self.n_demos}" if self.n_demos else self.method.name
+
+
+def cells_of(grid: Grid) -> list[Cell]:
+    """The grid's cells; a method without demonstrations has one."""
+    return [
+        Cell(METHODS[name], n_demos)
+        for name in grid.methods
+        for n_demos in (grid.n_demos if METHODS[name].uses_demonstrations else (0,))
+    ]
+
+
+def budget_of(grid: Grid, env: Env) -> Budget:
+    """How long each learner trains."""
+    most = [grid.max_steps]
+    if grid.max_episodes is not None:
+        most.append(grid.max_episodes * env.spec.max_episode_steps)
+    return Budget(
+        max_steps=min(steps for steps in most if steps is not None),
+        max_episodes=grid.max_episodes,
+        evaluate_every=grid.evaluate_every,
+        evaluation_starts=grid.evaluation_starts,
+        evaluate_every_episodes=grid.evaluate_every_episodes,
+        evaluation_starts_episodes=grid.evaluation_starts_episodes,
+    )
+
+
+def check(grid: Grid) -> None:
+    """Refuse what can be refused before any work.
+
+    Raises:
+        UserError: naming the option, what is wrong and what would be right.
+    """
+    for method in grid.methods:
+        if method not in METHODS:
+            raise UserError(f"--methods: unknown method {method!r}; there are {', '.join(METHODS)}")
+    try:
+        envs.make(grid.env)
+    except ValueError as error:
+        raise UserError(f"--env: {error}") from error
+    for name in ("methods", "n_demos"):
+        values = getattr(grid, name)
+        if not values or len(set(values)) < len(values):
+            raise UserError(f"--{name.replace('_', '-')}: give one or more, each once")
+    if grid.max_steps is None and grid.max_episodes is None:
+        raise UserError("--max-steps: give a number, or give --max-episodes")
+    if grid.seed < 0:
+        raise UserError(f"--seed: must not be negative, got {grid.seed}")
+    for name, value in _positive(grid):
+        if value is not None and value < 1:
+            raise UserError(f"--{name.replace('_', '-')}: must be at least 1, got {value}")
+    if grid.demos is None:
+        check_enough(grid, grid.experts.trajectories)
+
+
+def _positive(grid: Grid) -> list[tuple[str, int | None]]:
+    """Options that must be positive."""
+    settings = grid.settings
+    named = [("n_demos", number) for number in grid.n_demos]
+    named += [
+        (name, getattr(grid, name))
+        for name in (
+            "seeds",
+            "max_steps",
+            "max_episodes",
+            "evaluate_every",
+            "evaluation_starts",
+            "evaluate_every_episodes",
+            "evaluation_starts_episodes",
+            "devices",
+        )
+    ]
+    groups: list[tuple[str, Any, tuple[str, ...]]] = [
+        ("experts", grid.experts, ("seeds", "steps", "trajectories")),
+        (
+            "schedule",
+            settings.schedule,
+            (
+                "batch_size",
+                "replay_capacity",
+                "update_period",
+                "target_period",
+                "behaviour_cloning_steps",
+            ),
+        ),
+        (
+            "reward_schedule",
+            settings.reward_schedule,
+            ("period", "iterations", "anneal_steps", "batch_size", "recent"),
+        ),
+        ("hot_start", settings.hot_start, ("cells", "batch_size")),
+    ]
+    for prefix, options, names in groups:
+        named += [(f"{prefix}.{name}", getattr(options, name)) for name in names]
+    for units in (*settings.architecture.hidden, *settings.reward_schedule.hidden):
+        named.append(("architecture.hidden", units))
+    return named
+
+
+def load_demonstrations(grid: Grid, env: Env) -> Demonstrations:
+    """The file that `--demos` names.
+
+    Raises:
+        UserError: if it is missing, damaged, foreign, or holds too few.
+    """
+    assert grid.demos is not None
+    try:
+        pool = demonstrations.load(grid.demos, env.spec)
+    except FileNotFoundError as error:
+        raise UserError(f"--demos: there is no file {grid.demos}") from error
+    except (OSError, ValueError) as error:
+        raise UserError(f"--demos: {error}") from error
+    check_enough(grid, int(pool.episode[-1]) + 1)
+    return pool
+
+
+def check_enough(grid: Grid, held: int) -> None:
+    """Refuse to draw more demonstrations than the pool holds.
+
+    Raises:
+        UserError: saying how many there are.
+    """
+    asked = max(cell.n_demos for cell in cells_of(grid))
+    if asked > held:
+        raise UserError(f"--n-demos: {asked} asked, the pool holds {held}")

@@ -1,0 +1,136 @@
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+
+from cmedirl_jax import envs, methods
+from cmedirl_jax.methods import METHODS
+from experiments import planning
+from experiments.presets import PRESETS
+from experiments.run_grid import parse
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("method", METHODS)
+def test_every_preset_builds_every_method(name, method, spec):
+    preset = PRESETS[name]
+    planning.check(preset)
+    built = methods.compose(spec, METHODS[method], preset.settings, capacity=10)
+    assert (built.learner is not None) == METHODS[method].learned_reward
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_knows_its_name_and_its_folder(name):
+    assert PRESETS[name].preset == name
+    assert PRESETS[name].folder == Path("results") / name
+
+
+def test_the_default_study_is_the_tuned_one_of_the_design():
+    grid = parse([])
+    assert grid == PRESETS["tuned"]
+    assert grid.methods == ("ddpg", "hs-ddpg", "me-ddpg", "hs-me-ddpg")
+    assert (grid.n_demos, grid.seeds, grid.max_steps, grid.max_episodes) == (
+        (200,),
+        100,
+        12_000,
+        None,
+    )
+    assert (grid.evaluate_every, grid.evaluation_starts) == (250, 10)
+
+
+def test_paper_is_the_papers_letter():
+    grid = PRESETS["paper"]
+    settings = grid.settings
+    agent, exploration = settings.agent, settings.exploration
+    assert agent.actor_learning_rate == agent.critic_learning_rate == 1e-5
+    assert settings.reward.learning_rate == 1e-5
+    assert settings.schedule.batch_size == settings.reward_schedule.batch_size == 32
+    assert settings.schedule.replay_capacity == 10_000
+    assert (settings.schedule.target_period, agent.tau) == (300, 1.0)
+    assert agent.bootstrap_at_termination
+    assert agent.behaviour_cloning == agent.pre_activation_penalty == 0.0
+    assert exploration.kind == "epsilon-greedy"
+    epsilon = exploration.epsilon_greedy
+    assert (epsilon.epsilon_start, epsilon.epsilon_end, epsilon.epsilon_steps) == (1.0, 0.01, 5_000)
+    assert epsilon.hold == 1.0
+    assert settings.reward_schedule.storage == "store"
+    assert settings.reward_schedule.recent is None
+    assert settings.reward_schedule.stop is None
+    assert settings.reward_schedule.period == 1
+    assert math.isinf(settings.reward.bound)
+    assert settings.hot_start.critic == "softmax"
+    assert grid.seeds == 100
+    assert (grid.evaluate_every_episodes, grid.evaluation_starts_episodes) == (100, 100)
+    assert grid.max_steps is None
+    assert grid.evaluate_every == 1_000
+
+
+def test_a_budget_of_episodes_alone_leaves_room_for_the_longest():
+    grid = PRESETS["paper"]
+    budget = planning.budget_of(grid, envs.make(grid.env))
+    assert (budget.max_episodes, budget.max_steps) == (150, 150 * 999)
+
+
+@pytest.mark.parametrize(("max_steps", "expected"), [(1_000, 1_000), (10_000, 1_998)])
+def test_a_budget_of_both_takes_the_smaller(max_steps, expected):
+    grid = dataclasses.replace(PRESETS["tuned"], max_steps=max_steps, max_episodes=2)
+    assert planning.budget_of(grid, envs.make(grid.env)).max_steps == expected
+
+
+def test_a_method_without_demonstrations_has_one_cell():
+    grid = dataclasses.replace(PRESETS["tuned"], methods=("ddpg", "me-ddpg"), n_demos=(1, 10))
+    cells = planning.cells_of(grid)
+    assert [(cell.method.name, cell.n_demos) for cell in cells] == [
+        ("ddpg", 0),
+        ("me-ddpg", 1),
+        ("me-ddpg", 10),
+    ]
+    assert [cell.name for cell in cells] == ["ddpg", "me-ddpg-n1", "me-ddpg-n10"]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_is_what_the_command_line_makes_of_its_name(name):
+    assert parse(["--preset", name]) == PRESETS[name]
+
+
+def test_options_override_the_preset_before_and_after_its_name():
+    expected = dataclasses.replace(PRESETS["paper"], seeds=3, n_demos=(1, 10))
+    options = ["--seeds", "3", "--n-demos", "1", "10"]
+    assert parse(["--preset", "paper", *options]) == expected
+    assert parse([*options, "--preset=paper"]) == expected
+
+
+def test_dotted_options_reach_the_nested_settings_and_leave_the_rest_to_the_preset():
+    options = {
+        "--agent.tau": "0.5",
+        "--reward.bound": "0.2",
+        "--experts.steps": "70",
+        "--reward-schedule.stop": "None",
+        "--exploration.epsilon-greedy.hold": "4",
+        "--hot-start.critic": "quadratic",
+    }
+    grid = parse(["--preset", "smoke", *(word for option in options.items() for word in option)])
+    before = PRESETS["smoke"]
+    settings = before.settings
+    assert grid.settings == dataclasses.replace(
+        settings,
+        agent=settings.agent.replace(tau=0.5),
+        reward=settings.reward.replace(bound=0.2),
+        reward_schedule=dataclasses.replace(settings.reward_schedule, stop=None),
+        exploration=dataclasses.replace(
+            settings.exploration,
+            epsilon_greedy=settings.exploration.epsilon_greedy.replace(hold=4.0),
+        ),
+        hot_start=settings.hot_start.replace(critic="quadratic"),
+    )
+    assert grid.experts == dataclasses.replace(before.experts, steps=70)
+    assert dataclasses.replace(grid, settings=settings, experts=before.experts) == before
+
+
+@pytest.mark.parametrize("arguments", [["--preset", "none"], ["--tau", "0.5"], ["--seeds", "many"]])
+def test_what_tyro_finds_keeps_its_form(arguments, capsys):
+    with pytest.raises(SystemExit) as error:
+        parse(arguments)
+    assert error.value.code == 2
+    assert arguments[0] in capsys.readouterr().err

@@ -1,0 +1,36 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax import schedules
+from cmedirl_jax.schedules import RewardSchedule, Schedule
+
+
+def plans(schedule=None, reward=None, steps=60):
+    schedule = schedule or Schedule()
+    reward = reward or RewardSchedule()
+    return jax.vmap(lambda step: schedules.plan(step, schedule, reward))(jnp.arange(steps))
+
+
+def test_predicates_by_counting():
+    found = plans(
+        Schedule(learning_starts=10, update_period=3, target_period=7),
+        RewardSchedule(period=4, stop=30),
+    )
+    steps = range(60)
+    assert np.flatnonzero(found.learn).tolist() == [t for t in steps if t >= 10 and t % 3 == 0]
+    assert np.flatnonzero(found.update_targets).tolist() == [t for t in steps if t % 7 == 0]
+    assert np.flatnonzero(found.learn_reward).tolist() == [12, 16, 20, 24, 28]
+
+
+def test_a_reward_that_never_stops_and_is_never_annealed():
+    found = plans(Schedule(learning_starts=0), RewardSchedule(period=1, stop=None))
+    assert found.learn_reward.all()
+    assert (found.reward_weight == 1.0).all()
+
+
+def test_weights_fall_linearly_to_zero_and_stay_there():
+    found = plans(Schedule(behaviour_cloning_steps=50), RewardSchedule(anneal_steps=20))
+    steps = np.arange(60)
+    np.testing.assert_allclose(found.cloning_weight, np.clip(1 - steps / 50, 0, 1), atol=1e-6)
+    np.testing.assert_allclose(found.reward_weight, np.clip(1 - steps / 20, 0, 1), atol=1e-6)
