@@ -221,9 +221,13 @@ def make(
             state.agent,
         )
 
-        done = step.terminated | step.truncated
+        done = ended = step.terminated | step.truncated
+        if max_episodes is not None:
+            running = state.episode < max_episodes
+            done = ended & running
+            agent_state, reward_state = _keep_parameters(running, state, agent_state, reward_state)
         log = Log(
-            done=done if max_episodes is None else done & (state.episode < max_episodes),
+            done=done,
             terminated=step.terminated,
             episode_return=state.episode_return + step.reward,
             episode_length=state.episode_length + 1,
@@ -236,15 +240,13 @@ def make(
             agent=agent_state,
             reward=reward_state,
             storage=replay_state.storage,
-            exploration=_select(done, exploration.reset(exploration_state), exploration_state),
-            env=_select(done, fresh_env, env_state),
-            observation=_select(done, fresh_observation, step.observation),
-            episode=state.episode + log.done,
-            episode_return=jnp.where(done, 0.0, log.episode_return),
-            episode_length=jnp.where(done, 0, log.episode_length),
+            exploration=_select(ended, exploration.reset(exploration_state), exploration_state),
+            env=_select(ended, fresh_env, env_state),
+            observation=_select(ended, fresh_observation, step.observation),
+            episode=state.episode + done,
+            episode_return=jnp.where(ended, 0.0, log.episode_return),
+            episode_length=jnp.where(ended, 0, log.episode_length),
         )
-        if max_episodes is not None:
-            state = _stop_learning(state, state.episode >= max_episodes)
         return state, log
 
     def run(
@@ -276,20 +278,14 @@ def _select(predicate: jax.Array, on_true: Any, on_false: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(predicate, x, y), on_true, on_false)
 
 
-def _stop_learning(state: TrainingState, stopped: jax.Array) -> TrainingState:
-    """Set a stopped seed's learning rates to zero: cheaper than a select over every parameter."""
-    goes_on = 1.0 - stopped.astype(jnp.float32)
-    hparams = state.agent.hparams
-    agent = state.agent.replace(
-        hparams=hparams.replace(
-            actor_learning_rate=hparams.actor_learning_rate * goes_on,
-            critic_learning_rate=hparams.critic_learning_rate * goes_on,
-        )
+def _keep_parameters(
+    running: jax.Array, before: TrainingState, agent: DDPGState, reward: RewardState | None
+) -> tuple[DDPGState, RewardState | None]:
+    """The parameters that are read later stay a stopped seed's own; its other state may move."""
+    agent = agent.replace(
+        actor=_select(running, agent.actor, before.agent.actor),
+        critic=_select(running, agent.critic, before.agent.critic),
     )
-    if state.reward is None:
-        return state.replace(agent=agent)
-    hparams = state.reward.hparams
-    reward = state.reward.replace(
-        hparams=hparams.replace(learning_rate=hparams.learning_rate * goes_on)
-    )
-    return state.replace(agent=agent, reward=reward)
+    if reward is not None and before.reward is not None:
+        reward = reward.replace(params=_select(running, reward.params, before.reward.params))
+    return agent, reward

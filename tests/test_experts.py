@@ -108,6 +108,19 @@ def test_episodes_end_at_the_goal_or_by_the_time_limit(pool, spec):
     assert (length[~solved] == spec.max_episode_steps).all()
 
 
+def test_reaching_the_goal_at_the_last_step_is_no_truncation(env):
+    start = -0.5
+    _, limit = gymnasium_episode(np.array([start, 0.0]), STRENGTHS[0])
+    params = env.default_params.replace(start_low=start, start_high=start, max_episode_steps=limit)
+    spec = env.spec._replace(max_episode_steps=limit)
+    short = env._replace(spec=spec, default_params=params)
+    recorded = jax.jit(lambda key: experts.record(act, short, STRENGTHS[0], key, 1))
+    transition, running, truncated = recorded(jax.random.key(0))
+    assert running.all()
+    assert transition.terminated[0, -1]
+    assert not truncated.any()
+
+
 @pytest.fixture
 def make_pool(env, monkeypatch):
     """`make_pool` with the scripted policies in the place of trained experts.

@@ -207,12 +207,12 @@ def test_an_episode_does_not_inherit_a_held_action():
     assert action == 0.0
 
 
-MAKERS = [
+BEHAVIOURS = [
     exploration.gaussian(SPEC, GaussianHParams(scale=2.0)),
     exploration.ornstein_uhlenbeck(SPEC, OrnsteinUhlenbeckHParams(sigma=2.0)),
     exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=2.0)),
 ]
-JITTED = [jax.jit(behaviour.sample) for behaviour in MAKERS]
+JITTED = [jax.jit(behaviour.sample) for behaviour in BEHAVIOURS]
 kinds = pytest.mark.parametrize("kind", range(3), ids=["gaussian", "ou", "epsilon_greedy"])
 
 
@@ -223,7 +223,7 @@ kinds = pytest.mark.parametrize("kind", range(3), ids=["gaussian", "ou", "epsilo
     step=st.integers(0, 20_000),
 )
 def test_actions_stay_in_bounds_with_finite_density(kind, seed, mu, step):
-    state = MAKERS[kind].init(KEY)
+    state = BEHAVIOURS[kind].init(KEY)
     for key in jax.random.split(jax.random.key(seed), 3):
         action, log_density, state = JITTED[kind](key, state, jnp.float32([mu]), step)
         assert LOW <= action <= HIGH
@@ -232,7 +232,7 @@ def test_actions_stay_in_bounds_with_finite_density(kind, seed, mu, step):
 
 @kinds
 def test_sample_is_perturb_of_draw(kind):
-    behaviour = MAKERS[kind]
+    behaviour = BEHAVIOURS[kind]
     state, mu = behaviour.init(KEY), jnp.float32([0.3])
     sampled = behaviour.sample(KEY, state, mu, 100)
     perturbed = behaviour.perturb(state, mu, behaviour.draw(KEY), 100)

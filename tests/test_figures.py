@@ -29,13 +29,14 @@ def run(cells, seeds=3):
                 "expert": "best" if n_demos else "none",
                 "method": method,
                 "n_demos": n_demos,
-                "protocol": "steps",
+                "protocol": protocol,
                 "seed": seed,
                 "env_step": env_step,
                 "episode": env_step // 250,
-                "return_mean": value + seed,
+                "return_mean": value + seed if protocol == "steps" else 1e6,
             }
             for (method, n_demos), curve in cells.items()
+            for protocol in ("episodes", "steps")
             for seed in range(seeds)
             for env_step, value in zip(STEPS, curve, strict=True)
         ]

@@ -67,8 +67,7 @@ def float64(tree):
 
 @normalisations
 @pytest.mark.parametrize("normalise_observation", [True, False])
-@pytest.mark.parametrize("leading", [(), (5,), (2, 3)])
-def test_actor_is_the_perceptron(skewed_spec, normalisation, normalise_observation, leading):
+def test_actor_is_the_perceptron(skewed_spec, normalisation, normalise_observation):
     architecture = Architecture(
         hidden=(8, 6),
         actor_normalisation=normalisation,
@@ -76,24 +75,23 @@ def test_actor_is_the_perceptron(skewed_spec, normalisation, normalise_observati
     )
     actor = networks.make(skewed_spec, architecture).actor
     variables = randomised(actor.init(KEY))
-    observation, _ = inputs(skewed_spec, *leading)
+    observation, _ = inputs(skewed_spec, 5)
     x = scaled(skewed_spec, observation) if normalise_observation else observation
     expected, _ = reference(float64(variables), x, normalisation=normalisation)
     output = actor.apply(variables, observation)
-    assert output.shape == (*leading, skewed_spec.action_dim)
+    assert output.shape == (5, skewed_spec.action_dim)
     np.testing.assert_allclose(output, expected, rtol=1e-4, atol=1e-4)
 
 
 @normalisations
 @pytest.mark.parametrize("action_layer", [0, 1])
-@pytest.mark.parametrize("leading", [(), (5,), (2, 3)])
-def test_critic_is_the_perceptron(skewed_spec, normalisation, action_layer, leading):
+def test_critic_is_the_perceptron(skewed_spec, normalisation, action_layer):
     architecture = Architecture(
         hidden=(8, 6), critic_normalisation=normalisation, action_layer=action_layer
     )
     critic = networks.make(skewed_spec, architecture).critic
     variables = randomised(critic.init(KEY))
-    observation, action = inputs(skewed_spec, *leading)
+    observation, action = inputs(skewed_spec, 5)
     expected, _ = reference(
         float64(variables),
         scaled(skewed_spec, observation),
@@ -102,7 +100,7 @@ def test_critic_is_the_perceptron(skewed_spec, normalisation, action_layer, lead
         join=action_layer,
     )
     output = critic.apply(variables, observation, action)
-    assert output.shape == leading
+    assert output.shape == (5,)
     np.testing.assert_allclose(output, expected[..., 0], rtol=1e-4, atol=1e-4)
 
 
@@ -114,6 +112,19 @@ def test_layer_normalisation_adds_1e_5_to_the_variance(skewed_spec):
     expected, _ = reference(float64(variables), x, action, normalisation="layer")
     output = critic.apply(variables, observation, action)
     np.testing.assert_allclose(output, expected[:, 0], rtol=1e-3)
+
+
+@normalisations
+def test_leading_axes_are_mapped_over(skewed_spec, normalisation):
+    architecture = Architecture(hidden=(8,), critic_normalisation=normalisation)
+    critic = networks.make(skewed_spec, architecture).critic
+    variables = randomised(critic.init(KEY))
+    observation, action = inputs(skewed_spec, 2, 3)
+    output = critic.apply(variables, observation, action)
+    assert output.shape == (2, 3)
+    for index in np.ndindex(2, 3):
+        single = critic.apply(variables, observation[index], action[index])
+        np.testing.assert_allclose(output[index], single, rtol=1e-5)
 
 
 def test_training_normalises_by_the_batch_and_moves_the_running_statistics(skewed_spec):

@@ -213,8 +213,10 @@ def test_update_period():
     assert np.flatnonzero(log.learned).tolist() == [12, 16, 20, 24, 28]
 
 
-def test_a_seed_learns_nothing_after_its_last_episode():
-    _, state, advance = start("me-ddpg")
+@pytest.mark.parametrize("normalisation", ["layer", "batch"])
+def test_a_seed_learns_nothing_after_its_last_episode(normalisation):
+    architecture = {"actor_normalisation": normalisation, "critic_normalisation": normalisation}
+    _, state, advance = start("me-ddpg", with_(architecture=architecture))
     state, log = advance(state, 0, 2 * LIMIT, 2)
     assert state.episode == 2
     later, log = advance(state, 2 * LIMIT, 4 * LIMIT, 2)
