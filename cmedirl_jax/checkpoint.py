@@ -7,14 +7,21 @@ from typing import Any
 import jax
 from orbax.checkpoint import v1 as orbax
 
+_MARK = "_CHECKPOINT_METADATA"
+"""A file that every finished orbax checkpoint has."""
+
 
 def save(path: str | Path, tree: Any) -> None:
-    """Write a pytree of arrays to the folder `path`, replacing what is there; a whole one or none.
+    """Write a pytree of arrays to the folder `path`; a whole one or none.
 
     Raises:
+        FileExistsError: if there is something at `path` that is not a checkpoint, to be replaced.
         OSError: if the folder cannot be written.
     """
-    orbax.save(os.path.abspath(path), tree, overwrite=True)
+    path = os.path.abspath(path)
+    if os.path.exists(path) and not _is_checkpoint(path):
+        raise FileExistsError(f"{path}: exists and is not a checkpoint")
+    orbax.save(path, tree, overwrite=True)
 
 
 def load(path: str | Path, like: Any = None) -> Any:
@@ -22,7 +29,7 @@ def load(path: str | Path, like: Any = None) -> Any:
 
     Args:
         path: the folder.
-        like: a pytree of the same structure (arrays, or what `jax.eval_shape` gives), whose
+        like: a pytree of the same structure (of arrays, or as `jax.eval_shape` gives it), whose
             container types, dtypes and shapes the result takes on. Without it NamedTuples and
             dataclasses come back as dicts, tuples as lists.
 
@@ -31,16 +38,23 @@ def load(path: str | Path, like: Any = None) -> Any:
         ValueError: if its structure differs from `like`'s.
     """
     path = os.path.abspath(path)
-    if not orbax.is_orbax_checkpoint(path):
+    if not _is_checkpoint(path):
         raise FileNotFoundError(f"{path}: no checkpoint there")
     if like is None:
         return orbax.load(path)
-    abstract = jax.eval_shape(lambda: like) if _concrete(like) else like
+    # Orbax passes over a None that stands where the other tree has an array.
+    held = len(jax.tree.leaves(orbax.metadata(path).metadata))
+    if held != len(jax.tree.leaves(like)):
+        raise ValueError(f"{path}: holds {held} arrays, not {len(jax.tree.leaves(like))}")
+    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    abstract = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device), like
+    )
     try:
         return orbax.load(path, abstract)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: holds another structure ({error})") from error
 
 
-def _concrete(tree: Any) -> bool:
-    return not any(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in jax.tree.leaves(tree))
+def _is_checkpoint(path: str) -> bool:
+    return os.path.isfile(os.path.join(path, _MARK))

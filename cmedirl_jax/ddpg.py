@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from cmedirl_jax import checks, optimizers
 from cmedirl_jax import networks as networks_lib
-from cmedirl_jax import optimizers
 from cmedirl_jax.networks import ActorCritic
 from cmedirl_jax.types import EnvSpec, Numeric, Params, Transition
 
@@ -204,9 +204,10 @@ def make(
         update_actor: Numeric = True,
         update_targets: Numeric = True,
     ) -> tuple[DDPGState, DDPGInfo]:
-        _check_batch(spec, batch, "batch")
+        checks.transition_shapes(spec, batch, batch.observation.shape[:1], "batch")
         if demonstrations is not None:
-            _check_batch(spec, demonstrations, "demonstrations")
+            leading = demonstrations.observation.shape[:1]
+            checks.transition_shapes(spec, demonstrations, leading, "demonstrations")
         state, critic_loss_value, q_mean = update_critic(state, batch)
         state, actor_loss_value = _when(
             update_actor,
@@ -261,17 +262,3 @@ def _when(predicate: Numeric, true_fn: Callable, false_fn: Callable, operand: An
     if isinstance(predicate, bool):
         return true_fn(operand) if predicate else false_fn(operand)
     return jax.lax.cond(predicate, true_fn, false_fn, operand)
-
-
-def _check_batch(spec: EnvSpec, batch: Transition, name: str) -> None:
-    size = batch.observation.shape[:1]
-    expected = {
-        "observation": (*size, spec.observation_dim),
-        "action": (*size, spec.action_dim),
-        "reward": size,
-        "next_observation": (*size, spec.observation_dim),
-        "terminated": size,
-    }
-    found = {field: jnp.shape(leaf) for field, leaf in batch._asdict().items()}
-    if not size or found != expected:
-        raise ValueError(f"{name}: expected leaves of shape {expected}, got {found}")

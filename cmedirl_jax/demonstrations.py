@@ -6,10 +6,8 @@ learners with different demonstrations share one array, and nothing is ragged.
 """
 
 import json
-import zipfile
-import zlib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -78,7 +76,7 @@ def subset(
         ValueError: if the pool holds fewer than `n` (or `size`) episodes, or `n` is not positive.
     """
     size = size if size is not None else int(n)
-    if isinstance(n, int) and not 1 <= n <= size:
+    if isinstance(n, int | np.integer) and not 1 <= n <= size:
         raise ValueError(f"n must be between 1 and {size}, got {n}")
     if size > pool.start.shape[0]:
         raise ValueError(f"{size} demonstrations asked, the pool holds {pool.start.shape[0]}")
@@ -206,22 +204,8 @@ def load(path: str | Path, spec: EnvSpec | None = None) -> Demonstrations:
         ValueError: if it is damaged, foreign, of a newer version, or not valid for `spec`.
     """
     path = Path(path)
-    names = [*Transition._fields, "truncated", "episode"]
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(str(file["header"][()]))
-            arrays = {name: file[name] for name in names}
-    except (FileNotFoundError, IsADirectoryError, PermissionError):
-        raise
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        EOFError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
-        raise ValueError(f"{path}: not a readable demonstrations file ({error})") from error
+    with path.open("rb") as file:
+        header, arrays = _read(path, file)
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ValueError(f"{path}: not a demonstrations file of this library")
     if header.get("version") != FORMAT_VERSION:
@@ -241,3 +225,13 @@ def load(path: str | Path, spec: EnvSpec | None = None) -> Demonstrations:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return result
+
+
+def _read(path: Path, file: BinaryIO) -> tuple[Any, dict[str, np.ndarray]]:
+    names = [*Transition._fields, "truncated", "episode"]
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            return json.loads(str(archive["header"][()])), {name: archive[name] for name in names}
+    except Exception as error:
+        # A damaged archive raises whatever zipfile, zlib, json or numpy happen to stumble over.
+        raise ValueError(f"{path}: not a readable demonstrations file ({error})") from error

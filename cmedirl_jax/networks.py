@@ -50,19 +50,19 @@ class Architecture:
     normalise_observation: bool = True
     """Map the observation bounds to [-1, 1] at the input of each network."""
     action_layer: int = 0
-    """Hidden layer of the critic at which the action joins (0: the input; Lillicrap et al.: 1)."""
+    """Layer of the critic at which the action joins (0: the input; Lillicrap et al.: 1)."""
     output_scale: float = 3e-3
     """Half-width of the uniform initialisation of the last layer."""
 
 
 class MLP(nn.Module):
-    """A perceptron whose second input (the action), if any, joins at hidden layer `join`.
+    """A perceptron whose second input (the action), if any, joins at layer `join`.
 
     Attributes:
         hidden: units of each hidden layer.
         output_dim: units of the last, linear layer.
         normalisation: of each hidden layer, before its ReLU.
-        join: index of the hidden layer that also sees the second input.
+        join: index of the layer that also sees the second input; `len(hidden)` is the last one.
         output_scale: half-width of the last layer's uniform initialisation.
     """
 
@@ -84,6 +84,8 @@ class MLP(nn.Module):
             elif self.normalisation == "batch":
                 x = nn.BatchNorm(use_running_average=not train, momentum=0.99)(x)
             x = nn.relu(x)
+        if joined is not None and self.join == len(self.hidden):
+            x = jnp.concatenate([x, joined], axis=-1)
         return _dense(self.output_dim, self.output_scale)(x)
 
 
@@ -104,10 +106,10 @@ def actor(spec: EnvSpec, architecture: Architecture) -> Network:
 
 def critic(spec: EnvSpec, architecture: Architecture) -> Network:
     """An action-value function: observation `[..., O]`, action `[..., A]` -> value `[...]`."""
-    if not 0 <= architecture.action_layer < max(len(architecture.hidden), 1):
+    if not 0 <= architecture.action_layer <= len(architecture.hidden):
         raise ValueError(
-            f"action_layer must name one of the {len(architecture.hidden)} hidden layers, "
-            f"got {architecture.action_layer}"
+            f"action_layer must be between 0 and {len(architecture.hidden)}, the number of hidden "
+            f"layers, got {architecture.action_layer}"
         )
     mlp = MLP(
         hidden=architecture.hidden,

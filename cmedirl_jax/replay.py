@@ -12,6 +12,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import checks
 from cmedirl_jax.types import EnvSpec, Transition
 
 
@@ -89,16 +90,9 @@ def pack(spec: EnvSpec, transition: Transition) -> jax.Array:
     """A transition's leaves as rows `[..., D]` float32.
 
     Raises:
-        ValueError: if a leaf's last axis is not of `spec`'s size.
+        ValueError: if a leaf is not of `spec`'s size.
     """
-    if transition.observation.shape[-1:] != (spec.observation_dim,) or transition.action.shape[
-        -1:
-    ] != (spec.action_dim,):
-        raise ValueError(
-            f"{spec.id} has observations [..., {spec.observation_dim}] and actions "
-            f"[..., {spec.action_dim}], got {transition.observation.shape} and "
-            f"{transition.action.shape}"
-        )
+    checks.transition_shapes(spec, transition, jnp.shape(transition.reward), "transition")
     return jnp.concatenate(
         [
             transition.observation,

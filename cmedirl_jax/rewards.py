@@ -9,7 +9,8 @@ from cmedirl_jax.types import EnvSpec, Network
 def mlp(spec: EnvSpec, hidden: tuple[int, ...] = (64, 64)) -> Network:
     """A deep reward: observation `[..., O]`, action `[..., A]` -> `[...]`, before any bound.
 
-    The critic's shape without its normalisation: both inputs scaled to [-1, 1] and joined.
+    The critic's shape without its normalisation: the observation, scaled to [-1, 1], and the action
+    joined at the input.
     """
     return networks.critic(spec, networks.Architecture(hidden=hidden, critic_normalisation="none"))
 

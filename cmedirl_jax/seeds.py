@@ -21,17 +21,19 @@ def keys(key: jax.Array, count: int) -> jax.Array:
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, np.arange(count))
 
 
-def group_size(seeds: int, devices: int = 1, width: int = 64) -> int:
+def group_size(seeds: int, devices: int = 1, hidden: Sequence[int] = (64, 64)) -> int:
     """How many seeds to vmap together, for the least padding; 1 for networks too wide to share.
 
     Args:
         seeds: how many seeds there are.
         devices: how many devices share them.
-        width: units of the widest hidden layer.
+        hidden: units of each hidden layer.
     """
     per_device = -(-seeds // devices)
-    if width >= 128 or per_device < GROUP_SIZES.start:
-        return max(1, min(per_device, GROUP_SIZES.start) if width < 128 else 1)
+    if max(hidden, default=0) >= 128:
+        return 1
+    if per_device < GROUP_SIZES.start:
+        return per_device
     return min(GROUP_SIZES, key=lambda size: (-(-per_device // size) * size, -size))
 
 

@@ -94,7 +94,7 @@ def fit(
         evaluations = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), first, later)
         return Result(state, evaluations, jax.tree.map(lambda x: x.reshape(steps), log))
 
-    group = seeds_lib.group_size(seeds, width=max(settings.architecture.hidden))
+    group = seeds_lib.group_size(seeds, hidden=settings.architecture.hidden)
     keys = seeds_lib.keys(key, seeds_lib.padded(seeds, group))
     result = seeds_lib.map_groups(learn, group)(keys)
     return jax.tree.map(lambda x: x[:seeds], result)

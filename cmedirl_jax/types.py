@@ -54,11 +54,11 @@ class Transition(NamedTuple):
         terminated: `[...]` bool; a time limit is not termination and still bootstraps.
     """
 
-    observation: jax.Array
-    action: jax.Array
-    reward: jax.Array
-    next_observation: jax.Array
-    terminated: jax.Array
+    observation: Any
+    action: Any
+    reward: Any
+    next_observation: Any
+    terminated: Any
 
 
 class Network(NamedTuple):

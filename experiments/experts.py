@@ -45,7 +45,7 @@ def make_pool(
     """
     train_key, start_key = jax.random.split(key)
     settings = Settings()
-    group = seeds.group_size(options.seeds, len(devices), max(settings.architecture.hidden))
+    group = seeds.group_size(options.seeds, len(devices), settings.architecture.hidden)
     judge = judging.make(env, settings.architecture, group, devices)
     programs = cells.compile_method(
         env,
@@ -69,8 +69,11 @@ def make_pool(
         threshold=threshold,
         report=report,
     )
-    returns = result.evaluations[-1].evaluation.return_mean
-    chosen = choose(np.asarray(returns), which, threshold)
+    final = result.evaluations[-1]
+    returns = np.where(result.diverged, -np.inf, 0.0)
+    alive = ~result.diverged[final.seed]
+    returns[final.seed[alive]] = np.asarray(final.evaluation.return_mean)[alive]
+    chosen = choose(returns, which, threshold)
     if not chosen.size:
         raise UserError(
             f"--experts: none of {options.seeds} experts reached a return of {threshold:g} in "

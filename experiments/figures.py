@@ -1,5 +1,6 @@
 """The paper's Figures 3, 4 and 5, from the tables of a run."""
 
+import itertools
 from pathlib import Path
 
 import matplotlib
@@ -59,7 +60,7 @@ def average_return(
 ) -> Figure:
     """Figure 3: noise-free return over environment steps; behaviour return over episodes."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharey=True)
-    for colour, method in zip(COLOURS, _methods(evaluations), strict=False):
+    for colour, method in zip(itertools.cycle(COLOURS), _methods(evaluations), strict=False):
         rows = evaluations.filter((pl.col("method") == method) & (pl.col("protocol") == "steps"))
         _band(left, rows, "env_step", "return_mean", method, colour)
         rows = episodes.filter(pl.col("method") == method)
@@ -123,9 +124,11 @@ def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None
     numbers = sorted(set(summary.filter(pl.col("n_demos") > 0)["n_demos"]))
     positions = np.arange(len(numbers))
     methods = _methods(summary)
-    for index, (colour, method) in enumerate(zip(COLOURS, methods, strict=False)):
+    for index, (colour, method) in enumerate(zip(itertools.cycle(COLOURS), methods, strict=False)):
         rows = summary.filter(pl.col("method") == method).sort("n_demos")
-        low, middle, high = (rows[column + end].to_numpy() for end in ("_low", "", "_high"))
+        low, middle, high = (
+            rows[column + end].cast(pl.Float64).to_numpy() for end in ("_low", "", "_high")
+        )
         label = LABELS.get(method, method)
         if rows["n_demos"].max() == 0:
             axes.axhline(middle[0], color=colour, label=label)
@@ -133,9 +136,19 @@ def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None
             continue
         at = positions[np.isin(numbers, rows["n_demos"].to_numpy())]
         offset = 0.06 * (index - (len(methods) - 1) / 2)
-        # A never-reached median has no finite bar: it is left out rather than drawn at a limit.
-        bars = np.nan_to_num([middle - low, high - middle])
-        axes.errorbar(at + offset, middle, bars, color=colour, marker="o", capsize=3, label=label)
+        # What was never reached is left out; an arrow stands for an interval without upper bound.
+        unbounded = np.isnan(high)
+        bars = np.array([middle - low, np.where(unbounded, 0.0, high - middle)])
+        axes.errorbar(
+            at + offset,
+            middle,
+            bars,
+            lolims=unbounded,
+            color=colour,
+            marker="o",
+            capsize=3,
+            label=label,
+        )
     axes.set_xticks(positions, [str(number) for number in numbers])
     axes.set_xlabel("demonstrations $N_T$")
 

@@ -1,6 +1,5 @@
 """A whole run: demonstrations, then cell after cell, then the summary and the figures."""
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -51,20 +50,14 @@ def run(grid: Grid, devices: list[jax.Device], console: Console) -> pl.DataFrame
     planning.check(grid)
     env = envs.make(grid.env)
     given = None if grid.demos is None else planning.load_demonstrations(grid, env)
-    new = not grid.folder.exists()
-    folder = results.open_folder(grid)
+    results.check_folder(grid)
+    folder = grid.folder
     keys = Keys(*jax.random.split(jax.random.key(grid.seed), 3))
     plan = planning.cells_of(grid)
     done = results.finished(folder)
     todo = [cell for cell in plan if (cell.method.name, cell.n_demos) not in done]
     if todo:
-        try:
-            _train_cells(grid, env, keys, folder, given, todo, devices, console)
-        except UserError:
-            # A refusal (no expert solved the task) leaves nothing behind.
-            if new:
-                shutil.rmtree(folder)
-            raise
+        _train_cells(grid, env, keys, given, todo, devices, console)
     return _conclude(grid, env, folder, plan, redraw=bool(todo))
 
 
@@ -72,21 +65,19 @@ def _train_cells(
     grid: Grid,
     env: Env,
     keys: Keys,
-    folder: Path,
     given: Demonstrations | None,
     todo: list[Cell],
     devices: list[jax.Device],
     console: Console,
 ) -> None:
     budget = planning.budget_of(grid, env)
-    pool_path = folder / "demonstrations" / "pool.npz"
+    pool_path = grid.folder / "demonstrations" / "pool.npz"
     needs_pool = any(cell.n_demos for cell in todo)
-    pool = given if given is not None else _reusable(pool_path, grid, env)
+    pool = given if given is not None else _reusable(pool_path, env)
     trains_experts = needs_pool and pool is None
     expert_steps = grid.experts.seeds * grid.experts.steps
     total = len(todo) * grid.seeds * budget.max_steps + expert_steps * trains_experts
-    width = max(grid.settings.architecture.hidden)
-    group = seeds.group_size(grid.seeds, len(devices), width)
+    group = seeds.group_size(grid.seeds, len(devices), grid.settings.architecture.hidden)
     judge = judging.make(env, grid.settings.architecture, group, devices)
     programs: dict[str, Programs] = {}
     with reporter(console, len(todo) + trains_experts, total) as report:
@@ -103,6 +94,10 @@ def _train_cells(
         if needs_pool:
             assert pool is not None
             planning.check_enough(grid, int(pool.episode[-1]) + 1)
+        # Only now: a refusal, or a run stopped among the experts, leaves nothing behind.
+        folder = results.open_folder(grid)
+        if needs_pool:
+            assert pool is not None
             if not pool_path.exists():
                 pool_path.parent.mkdir(exist_ok=True)
                 demonstrations.save(pool_path, pool)
@@ -169,7 +164,7 @@ def _train_cell(
     results.append(folder, rows)
 
 
-def _reusable(path: Path, grid: Grid, env: Env) -> Demonstrations | None:
+def _reusable(path: Path, env: Env) -> Demonstrations | None:
     if not path.exists():
         return None
     try:
@@ -222,8 +217,9 @@ def _conclude(
     if redraw or not (folder / "summary.csv").exists():
         pool_path = folder / "demonstrations" / "pool.npz"
         expert = None
-        if pool_path.exists():
-            expert = float(demonstrations.returns(demonstrations.load(pool_path)).mean())
+        pool = _reusable(pool_path, env)
+        if pool is not None:
+            expert = float(demonstrations.returns(pool).mean())
         figures.draw(
             folder / "figures", evaluations, episodes, summary, expert, env.spec.reward_threshold
         )

@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple
 
-from cmedirl_jax import demonstrations, envs
+from cmedirl_jax import demonstrations, envs, networks
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.methods import METHODS, Method
@@ -57,7 +57,7 @@ def check(grid: Grid) -> None:
         if method not in METHODS:
             raise UserError(f"--methods: unknown method {method!r}; there are {', '.join(METHODS)}")
     try:
-        envs.make(grid.env)
+        env = envs.make(grid.env)
     except ValueError as error:
         raise UserError(f"--env: {error}") from error
     for name in ("methods", "n_demos"):
@@ -66,11 +66,15 @@ def check(grid: Grid) -> None:
             raise UserError(f"--{name.replace('_', '-')}: give one or more, each once")
     if grid.max_steps is None and grid.max_episodes is None:
         raise UserError("--max-steps: give a number, or give --max-episodes")
-    if grid.seed < 0:
-        raise UserError(f"--seed: must not be negative, got {grid.seed}")
+    if not 0 <= grid.seed < 2**32:
+        raise UserError(f"--seed: must be between 0 and 2^32 - 1, got {grid.seed}")
     for name, value in _positive(grid):
         if value is not None and value < 1:
             raise UserError(f"--{name.replace('_', '-')}: must be at least 1, got {value}")
+    try:
+        networks.make(env.spec, grid.settings.architecture)
+    except ValueError as error:
+        raise UserError(f"--architecture: {error}") from error
     if grid.demos is None:
         check_enough(grid, grid.experts.trajectories)
 
@@ -114,8 +118,8 @@ def _positive(grid: Grid) -> list[tuple[str, int | None]]:
     ]
     for prefix, options, names in groups:
         named += [(f"{prefix}.{name}", getattr(options, name)) for name in names]
-    for units in (*settings.architecture.hidden, *settings.reward_schedule.hidden):
-        named.append(("architecture.hidden", units))
+    named += [("architecture.hidden", units) for units in settings.architecture.hidden]
+    named += [("reward_schedule.hidden", units) for units in settings.reward_schedule.hidden]
     return named
 
 

@@ -6,6 +6,7 @@ table is replaced whole, so a run that was cut off leaves only finished cells be
 
 import contextlib
 import dataclasses
+import hashlib
 import importlib.metadata
 import json
 import math
@@ -30,23 +31,43 @@ _NOT_COMPARED = ("out", "devices")
 
 def describe(grid: Grid) -> dict[str, Any]:
     """The fully resolved configuration as JSON values."""
-    return _plain(dataclasses.asdict(grid))
+    config = dataclasses.asdict(grid)
+    if grid.demos is not None:
+        # Another file under the same name is another configuration.
+        with grid.demos.open("rb") as file:
+            config["demos_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+    return _plain(config)
 
 
-def open_folder(grid: Grid) -> Path:
-    """Make the run's folder, or enter it again.
+def check_folder(grid: Grid) -> None:
+    """See that the run can use its folder, which need not be there yet; writes nothing.
 
     Raises:
         UserError: if it cannot be written, or holds a run of another configuration.
     """
     folder = grid.folder
     path = folder / "config.json"
-    if path.exists():
-        _compare(path, describe(grid))
+    try:
+        if path.exists():
+            _compare(path, describe(grid))
+        nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+        with tempfile.TemporaryFile(dir=nearest):
+            pass
+    except OSError as error:
+        raise UserError(f"--out: cannot write to {folder} ({error.strerror})") from error
+
+
+def open_folder(grid: Grid) -> Path:
+    """Make the run's folder with its config.json, or enter it again.
+
+    Raises:
+        UserError: as `check_folder`.
+    """
+    check_folder(grid)
+    folder = grid.folder
+    path = folder / "config.json"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
     except OSError as error:
         raise UserError(f"--out: cannot write to {folder} ({error.strerror})") from error
     if not path.exists():
@@ -60,12 +81,12 @@ def open_folder(grid: Grid) -> Path:
 def _compare(path: Path, config: dict[str, Any]) -> None:
     try:
         written = json.loads(path.read_text())
-        schema, before = written["schema"], written["config"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        schema, before = written["schema"], _flat(written["config"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"--out: {path} is not a readable configuration ({error})") from error
     if schema != SCHEMA:
         raise UserError(f"--out: {path} has schema {schema!r}, this version writes {SCHEMA}")
-    before, now = _flat(before), _flat(config)
+    now = _flat(config)
     for name in sorted(before.keys() | now.keys()):
         if name not in _NOT_COMPARED and before.get(name) != now.get(name):
             raise UserError(
@@ -92,15 +113,13 @@ def finished(folder: Path) -> set[tuple[str, int]]:
         UserError: if a table is damaged.
     """
     try:
-        tables = [read(folder, name) for name in TABLES]
+        evaluations, *_ = [read(folder, name) for name in reversed(TABLES)]
+        if evaluations is None:
+            return set()
+        return set(evaluations.select("method", "n_demos").unique().iter_rows())
     except (OSError, pl.exceptions.PolarsError) as error:
-        raise UserError(f"--out: {folder} holds a damaged table ({error})") from error
-    cells = [
-        set(table.select("method", "n_demos").unique().iter_rows())
-        for table in tables
-        if table is not None
-    ]
-    return set.intersection(*cells) if cells else set()
+        reason = str(error).splitlines()[0]
+        raise UserError(f"--out: {folder} holds a damaged table ({reason})") from error
 
 
 def append(folder: Path, rows: dict[str, pl.DataFrame]) -> None:

@@ -1,6 +1,7 @@
 """`python -m experiments.run_grid`: train the grid, print the summary, draw the figures."""
 
 import argparse
+import contextlib
 import os
 import sys
 from collections.abc import Sequence
@@ -62,7 +63,9 @@ def start_devices(grid: Grid) -> list[jax.Device]:
     # A device wants a few seeds to itself: fewer than four a device do not fill a vector unit.
     wanted = grid.devices or max(1, min(cores or 1, grid.seeds // 4))
     if grid.devices is None or grid.devices <= (cores or 1):
-        jax.config.update("jax_num_cpu_devices", wanted)
+        # Once JAX has started (a second call in one process) it keeps the devices it has.
+        with contextlib.suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", wanted)
     devices = jax.devices()
     available = len(devices) if devices[0].platform != "cpu" else cores or 1
     if grid.devices is not None and grid.devices > available:

@@ -155,8 +155,8 @@ def summarise(
         **{name: first[name] for name in ("expert", "method", "n_demos")},
         "seeds": len(found),
         **_named("converged_fraction", share(converged)),
-        **_named("convergence_env_step_median", median(columns.convergence_env_step)),
-        **_named("convergence_episode_median", median(columns.convergence_episode)),
+        **_named("convergence_env_step_median", _from_zero(median(columns.convergence_env_step))),
+        **_named("convergence_episode_median", _from_zero(median(columns.convergence_episode))),
     }
     # Under a budget of steps a failing seed lives fewer episodes than a succeeding one: a mean over
     # episodes then says something only if no seed failed.
@@ -192,6 +192,11 @@ def summarise(
         "gymnasium_difference_max": float(seeds["gymnasium_difference"].max()),
     }
     return row
+
+
+def _from_zero(interval: Interval) -> Interval:
+    """The interval of a count; its empty bounds in a table then all mean 'never'."""
+    return interval._replace(low=max(interval.low, 0.0))
 
 
 def _named(name: str, interval: Interval) -> dict[str, float | None]:

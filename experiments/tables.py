@@ -48,7 +48,7 @@ def rows(
             }
         )
         for found in result.evaluations
-    ).sort("protocol", "seed", "env_step", maintain_order=True)
+    ).sort("seed", "env_step", maintain_order=True)
     episodes = result.episodes
     order = np.lexsort((episodes.episode, episodes.seed))
     count = len(result.env_steps)

@@ -1,4 +1,5 @@
 import hypothesis
+import jax
 import numpy as np
 import pytest
 
@@ -8,6 +9,14 @@ from cmedirl_jax.types import EnvSpec
 # The first example of a test compiles, so deadlines would only measure the compiler.
 hypothesis.settings.register_profile("reproducible", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("reproducible")
+
+
+@pytest.fixture(autouse=True)
+def quick_compilation(request):
+    """Most tests compile for longer than they run; those that train many seeds do not."""
+    jax.config.update(
+        "jax_disable_most_optimizations", request.node.get_closest_marker("statistical") is None
+    )
 
 
 @pytest.fixture(scope="session")

@@ -182,7 +182,6 @@ def test_no_expert_that_solved_the_task_is_a_users_error(make_pool):
         make_pool([0, 1], [89.0, 0.0])
 
 
-@pytest.mark.xfail(strict=True, reason="make_pool takes rows of the evaluation for seeds")
 def test_a_diverged_expert_does_not_shift_the_others(make_pool):
     pool = make_pool([1], [97.0])
     assert pool.metadata["experts_demonstrating"] == [1]

@@ -231,7 +231,7 @@ def test_infinite_observation_bounds_cannot_be_normalised(skewed_spec):
     networks.make(unbounded, Architecture(normalise_observation=False))
 
 
-@pytest.mark.parametrize("action_layer", [-1, 2])
-def test_the_action_must_join_at_a_hidden_layer(skewed_spec, action_layer):
-    with pytest.raises(ValueError, match=f"one of the 2 hidden layers, got {action_layer}"):
+@pytest.mark.parametrize("action_layer", [-1, 3])
+def test_the_action_must_join_at_a_layer(skewed_spec, action_layer):
+    with pytest.raises(ValueError, match=f"between 0 and 2, .*, got {action_layer}"):
         networks.make(skewed_spec, Architecture(hidden=(8, 6), action_layer=action_layer))

@@ -141,7 +141,7 @@ def test_capacity_must_be_positive(capacity):
 @pytest.mark.parametrize("leaf", ["observation", "action", "next_observation"])
 def test_leaves_of_another_size_are_refused(leaf):
     wrong = transition(1)._replace(**{leaf: np.zeros(3, np.float32)})
-    with pytest.raises(ValueError, match=r"observations \[\.\.\., 2\] and actions \[\.\.\., 1\]"):
+    with pytest.raises(ValueError, match=f"expected leaves of shape .*{leaf}"):
         replay.pack(SPEC, wrong)
 
 

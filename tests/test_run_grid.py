@@ -63,10 +63,6 @@ def refused(main, tmp_path, capsys):
     return run
 
 
-def broken(*values, reason, raises=None):
-    return pytest.param(*values, marks=pytest.mark.xfail(strict=True, raises=raises, reason=reason))
-
-
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -81,7 +77,7 @@ def broken(*values, reason, raises=None):
             "--env: unknown environment 'Walker2d-v5'; there are: MountainCarContinuous-v0",
         ),
         ("--max-steps None", "--max-steps: give a number, or give --max-episodes"),
-        ("--seed -1", "--seed: must not be negative, got -1"),
+        ("--seed -1", "--seed: must be between 0 and 2^32 - 1, got -1"),
         ("--demos none.npz", "--demos: there is no file none.npz"),
     ],
 )
@@ -108,7 +104,7 @@ def test_what_cannot_work_is_refused_in_a_line(refused, arguments, line):
         "--reward-schedule.period",
         "--hot-start.cells",
         "--architecture.hidden",
-        broken("--reward-schedule.hidden", reason="check names --architecture.hidden"),
+        "--reward-schedule.hidden",
     ],
 )
 def test_sizes_must_be_positive(refused, option, size):
@@ -118,15 +114,9 @@ def test_sizes_must_be_positive(refused, option, size):
 @pytest.mark.parametrize(
     ("arguments", "option"),
     [
-        broken("--architecture.hidden", "--architecture.hidden", raises=ValueError, reason="max()"),
-        broken(
-            "--architecture.action-layer 5",
-            "--architecture.action-layer",
-            raises=ValueError,
-            reason="networks.critic finds it",
-        ),
-        broken(f"--seed {2**64}", "--seed", raises=OverflowError, reason="jax.random.key finds it"),
-        broken(f"--out {'x' * 300}", "--out", raises=OSError, reason="Path.exists raises"),
+        ("--architecture.action-layer 5", "--architecture"),
+        (f"--seed {2**64}", "--seed"),
+        (f"--out {'x' * 300}", "--out"),
     ],
 )
 def test_what_only_the_library_finds_is_refused_too(refused, arguments, option):
@@ -155,7 +145,7 @@ def test_more_demonstrations_than_the_file_holds_are_refused(refused, demos):
     "damage",
     [
         "garbage",
-        broken("cut short", reason="numpy leaves the file open, to warn when it is collected"),
+        "cut short",
         "foreign",
         "another environment",
     ],
@@ -199,8 +189,8 @@ def test_another_configuration_in_the_same_folder_is_refused(refused, option, be
     "out",
     [
         "run",
-        broken("new/run", reason="the folder's own folder stays"),
-        broken("old", reason="config.json stays"),
+        "new/run",
+        "old",
     ],
 )
 def test_a_run_without_an_able_expert_leaves_everything_as_it_was(

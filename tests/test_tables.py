@@ -106,15 +106,15 @@ def test_every_row_names_its_cell(found, name):
     assert labels.rows() == [("best", "hs-ddpg", 10)]
 
 
-def test_evaluations_are_in_order_of_protocol_seed_and_step(found):
+def test_evaluations_are_in_order_of_seed_and_step(found):
     table = found["evaluations"]
     assert table.select("protocol", "seed", "env_step", "return_mean").rows() == [
-        ("episodes", 0, 250, 250.0),
-        ("episodes", 2, 250, 252.0),
         ("steps", 0, 0, 0.0),
+        ("episodes", 0, 250, 250.0),
         ("steps", 0, 250, 250.0),
         ("steps", 1, 0, 1.0),
         ("steps", 2, 0, 2.0),
+        ("episodes", 2, 250, 252.0),
         ("steps", 2, 250, 252.0),
     ]
 
