@@ -195,9 +195,7 @@ def make(
         transition = Transition(
             state.observation, action, step.reward, step.observation, step.terminated
         )
-        replay_state = replay.add(
-            ReplayState(state.storage, now.step), update.collect(state.reward, transition, now)
-        )
+        replay_state = replay.add(ReplayState(state.storage, now.step), transition)
 
         reward_state = state.reward
         if learner is not None:
@@ -207,6 +205,11 @@ def make(
                 lambda reward: reward,
                 reward_state,
             )
+
+        if update.stores_shaped:
+            # Algorithm 2: the reward learns first, then r* is stored. The same row is written over.
+            shaped = update.shape(reward_state, transition, now)
+            replay_state = replay.add(ReplayState(replay_state.storage, now.step), shaped)
 
         def learn(agent_state: DDPGState):
             agent_state, info = update.update_agent(
@@ -256,7 +259,7 @@ def make(
         max_episodes: Numeric | None = None,
     ) -> tuple[TrainingState, Log]:
         pool = None if data is None else data.transition
-        # Hashing a chunk's randomness in one go costs a tenth of hashing it step by step.
+        # A chunk's randomness is hashed in one vectorised go, not step by step.
         draws = jax.vmap(draw, in_axes=(None, None, 0))(state.key, state.subset, steps)
 
         def body(state: TrainingState, inputs: tuple[_Draws, Plan]):

@@ -35,8 +35,8 @@ class Updates(NamedTuple):
 
     Attributes:
         draw: `(key, subset) -> Draws`.
-        collect: `(reward_state, transition, plan) -> Transition` as it goes into the replay: with
-            r* in place of r_e where the settings say that r* is stored.
+        stores_shaped: r* is stored in the replay in place of r_e (static).
+        shape: `(reward_state, batch, plan) -> Transition` with r* in place of r_e (Eq. 10).
         update_reward: `(reward_state, pool, replay_state, draws) -> RewardState`, K iterations of
             Algorithm 1.
         update_agent: `(agent_state, reward_state, pool, replay_state, draws, plan) -> (DDPGState,
@@ -44,7 +44,8 @@ class Updates(NamedTuple):
     """
 
     draw: Callable[[jax.Array, DemonstrationSubset | None], Draws]
-    collect: Callable[[RewardState | None, Transition, Plan], Transition]
+    stores_shaped: bool
+    shape: Callable[[RewardState | None, Transition, Plan], Transition]
     update_reward: Callable[[RewardState, Transition, ReplayState, Draws], RewardState]
     update_agent: Callable[..., tuple[DDPGState, DDPGInfo]]
 
@@ -54,7 +55,7 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
     agent, learner, _, replay = algorithm
     schedule = settings.reward_schedule
     clones = method.hot_start and settings.agent.behaviour_cloning > 0
-    stores_shaped = schedule.storage == "store"
+    stores_shaped = learner is not None and schedule.storage == "store"
     reward_batch = schedule.iterations * schedule.batch_size
     agent_batch = settings.schedule.batch_size
 
@@ -70,14 +71,11 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
             else demonstrations.sample_index(demonstrations_key, subset, demonstrated),
         )
 
-    def shaped(reward_state: RewardState | None, batch: Transition, plan: Plan) -> Transition:
+    def shape(reward_state: RewardState | None, batch: Transition, plan: Plan) -> Transition:
         if learner is None or reward_state is None:
             return batch
         r_d = learner.reward(reward_state, batch.observation, batch.action)
         return batch._replace(reward=shaping.additive(batch.reward, r_d, plan.reward_weight))
-
-    def collect(reward_state: RewardState | None, transition: Transition, plan: Plan) -> Transition:
-        return shaped(reward_state, transition, plan) if stores_shaped else transition
 
     def update_reward(
         reward_state: RewardState, pool: Transition, replay_state: ReplayState, draws: Draws
@@ -102,7 +100,7 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
     ) -> tuple[DDPGState, DDPGInfo]:
         batch = replay.take(replay_state, draws.batch)
         if not stores_shaped:
-            batch = shaped(reward_state, batch, plan)
+            batch = shape(reward_state, batch, plan)
         if not clones:
             return agent.update(agent_state, batch, update_targets=plan.update_targets)
         hparams = agent_state.hparams
@@ -115,7 +113,7 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
         )
         return agent_state.replace(hparams=hparams), info
 
-    return Updates(draw, collect, update_reward, update_agent)
+    return Updates(draw, stores_shaped, shape, update_reward, update_agent)
 
 
 def _rows(pool: Any, index: jax.Array) -> Any:

@@ -157,6 +157,25 @@ def test_recomputing_stores_the_environments_reward_and_storing_the_shaped_one()
         np.testing.assert_allclose(log.episode_return[-1], environment.sum(), rtol=1e-4)
 
 
+def test_the_reward_learns_before_its_value_is_stored():
+    """Algorithm 2's order, with one update at step 10."""
+    settings = with_(
+        reward_schedule={"storage": "store", "period": 10, "stop": 11}, reward={"bound": 50.0}
+    )
+    trainer, state, advance = start("me-ddpg", settings)
+    before = state.reward
+    state, _ = advance(state, 0, 20)
+    rows = stored(state, 20)
+    learned = np.asarray(rows.reward) + 0.1 * rows.action[:, 0] ** 2
+    old, new = (
+        np.asarray(trainer.algorithm.learner.reward(reward, rows.observation, rows.action))
+        for reward in (before, state.reward)
+    )
+    assert np.abs(new - old).min() > 1e-6
+    np.testing.assert_allclose(learned[:10], old[:10], rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(learned[10:], new[10:], rtol=1e-3, atol=1e-6)
+
+
 def test_storing_and_recomputing_a_frozen_reward_learn_the_same():
     agents = []
     for storage in ("recompute", "store"):
