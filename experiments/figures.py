@@ -87,7 +87,7 @@ def average_return(
         ylabel="average return",
     )
     right.set(title="Training episodes, with exploration noise", xlabel="episodes")
-    left.legend(frameon=False, loc="lower right")
+    _legend(figure, left)
     seeds = evaluations["seed"].n_unique()
     n_demos = evaluations["n_demos"].max()
     figure.suptitle(
@@ -103,7 +103,7 @@ def convergence(summary: pl.DataFrame) -> Figure:
     left.set(ylabel="episodes until convergence (median)")
     _over_demonstrations(right, summary, "convergence_env_step_median")
     right.set(ylabel="environment steps until convergence (median)")
-    left.legend(frameon=False)
+    _legend(figure, left)
     figure.suptitle("First evaluation at the reward threshold; 95% intervals", fontsize=10)
     return figure
 
@@ -115,7 +115,7 @@ def return_after_convergence(summary: pl.DataFrame, expert: float | None) -> Fig
     if expert is not None:
         axes.axhline(expert, color="0.4", linestyle="--", linewidth=1, label="demonstrations")
     axes.set(ylabel="average return after convergence")
-    axes.legend(frameon=False)
+    _legend(figure, axes)
     figure.suptitle("Mean over seeds and its 95% interval", fontsize=10)
     return figure
 
@@ -164,6 +164,13 @@ def _band(axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, colour: s
     axes.fill_between(
         points[x], intervals[:, 1], intervals[:, 2], color=colour, alpha=0.2, linewidth=0
     )
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    """One legend for the figure, below it, where it hides nothing."""
+    handles, labels = axes.get_legend_handles_labels()
+    columns = min(len(labels), 3 * len(figure.axes))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
 
 
 def _methods(table: pl.DataFrame) -> list[str]:
