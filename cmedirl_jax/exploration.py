@@ -92,7 +92,7 @@ class HeldActionState(flax.struct.PyTreeNode):
 
 def gaussian(spec: EnvSpec, hparams: GaussianHParams | None = None) -> Exploration:
     """clip(mu(s) + sigma eps) with eps ~ N(0, I); its state is its hyperparameters."""
-    hparams = hparams or GaussianHParams()
+    hparams = _traced(hparams or GaussianHParams())
 
     def perturb(state: GaussianHParams, action: jax.Array, noise: jax.Array, step: Numeric):
         del step
@@ -115,7 +115,7 @@ def ornstein_uhlenbeck(
 
     The density is conditional on x_{t-1}.
     """
-    hparams = hparams or OrnsteinUhlenbeckHParams()
+    hparams = _traced(hparams or OrnsteinUhlenbeckHParams())
 
     def init(key: jax.Array) -> OrnsteinUhlenbeckState:
         del key
@@ -142,7 +142,7 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
     The density is conditional on the phase: epsilon / volume where a random action begins,
     1 / volume while one is held, 1 - epsilon (a mass at mu(s)) where the action is greedy.
     """
-    hparams = hparams or EpsilonGreedyHParams()
+    hparams = _traced(hparams or EpsilonGreedyHParams())
     log_volume = float(jnp.sum(jnp.log(2.0 * _half_width(spec))))
 
     def init(key: jax.Array) -> HeldActionState:
@@ -187,6 +187,11 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
 def _epsilon(hparams: EpsilonGreedyHParams, step: Numeric) -> jax.Array:
     progress = jnp.clip(step / hparams.epsilon_steps, 0.0, 1.0)
     return hparams.epsilon_start + progress * (hparams.epsilon_end - hparams.epsilon_start)
+
+
+def _traced(hparams: Any) -> Any:
+    """Hyperparameters as float32 arrays, so that a state has one type whoever made it."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams)
 
 
 def _half_width(spec: EnvSpec) -> jax.Array:

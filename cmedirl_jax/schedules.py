@@ -83,7 +83,9 @@ def plan(step: jax.Array, schedule: Schedule, reward_schedule: RewardSchedule) -
     return Plan(
         step=step,
         learn=learns & (step % schedule.update_period == 0),
-        update_targets=step % schedule.target_period == 0,
+        # A multiple was passed since the update before this one.
+        update_targets=step // schedule.target_period
+        > (step - schedule.update_period) // schedule.target_period,
         learn_reward=learn_reward,
         reward_weight=reward_weight,
         cloning_weight=_falling(step, schedule.behaviour_cloning_steps),

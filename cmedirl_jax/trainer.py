@@ -2,7 +2,7 @@
 
     trainer = training.make(env, METHODS["hs-me-ddpg"], Settings(), capacity=12_000)
     states = jax.vmap(trainer.init, in_axes=(0, None, None))(keys, data, 200)
-    states, log = jax.jit(jax.vmap(trainer.run, in_axes=(0, None, 0)))(states, data, steps)
+    states, log = jax.jit(jax.vmap(trainer.run, in_axes=(0, None, None)))(states, data, steps)
 
 Every step's randomness is drawn from `fold_in(seed's key, step)`, so that what a seed does depends
 neither on how many seeds run beside it nor on how its steps are cut into chunks.
@@ -33,7 +33,7 @@ class TrainingState(flax.struct.PyTreeNode):
     """One seed.
 
     Attributes:
-        key: the seed's own key; never advanced, steps fold into it.
+        key: of the seed's steps; never advanced, each step folds its number into it.
         agent: DDPG's state.
         reward: the learned reward's state, or None.
         storage: `[capacity, D]`, the replay's rows; its count is the number of steps taken.
@@ -137,7 +137,11 @@ def make(
     update = updates.make(algorithm, method, settings)
 
     def init(key: jax.Array, data: HotStartData | None, n_demonstrations: Numeric) -> TrainingState:
-        agent_key, fit_key, reward_key, env_key, noise_key, subset_key = jax.random.split(key, 6)
+        # Apart from the steps' keys: folding i into a key gives the i-th key of its split.
+        setup_key, steps_key = jax.random.split(key)
+        agent_key, fit_key, reward_key, env_key, noise_key, subset_key = jax.random.split(
+            setup_key, 6
+        )
         state = agent.init(agent_key)
         subset = None
         if method.uses_demonstrations:
@@ -158,7 +162,7 @@ def make(
             state = agent.init(agent_key, params)
         env_state, observation = env.reset(env_key, env_params)
         return TrainingState(
-            key=key,
+            key=steps_key,
             agent=state,
             reward=learner.init(reward_key) if learner else None,
             storage=replay.init().storage,
