@@ -35,7 +35,8 @@ class DDPGHParams(flax.struct.PyTreeNode):
     pre_activation_penalty: float = 1e-3
     """Weight of the mean squared pre-activation in the actor's loss; keeps tanh off its ends."""
     behaviour_cloning: float = 0.0
-    """Weight of the actor's squared error on the demonstrations passed to `update`."""
+    """Weight of the actor's squared error on the demonstrations passed to `update`; the `tuned`
+    preset sets 1."""
     bootstrap_at_termination: bool = flax.struct.field(pytree_node=False, default=False)
     """Leave (1 - terminated) out of the target, as Algorithm 2 is printed."""
 
@@ -159,7 +160,7 @@ def make(
         )
 
     def act(state: DDPGState, observation: jax.Array) -> jax.Array:
-        return networks.squash(networks.actor.apply(state.actor, observation))
+        return networks_lib.policy(networks, state.actor, observation)
 
     def value(state: DDPGState, observation: jax.Array, action: jax.Array) -> jax.Array:
         return networks.critic.apply(state.critic, observation, action)
@@ -223,7 +224,7 @@ def make(
 
 def td_targets(networks: ActorCritic, state: DDPGState, batch: Transition) -> jax.Array:
     """y = r + gamma (1 - terminated) Q'(s', mu'(s')), `[B]` (Algorithm 2; the mask is DDPG's)."""
-    next_action = networks.squash(networks.actor.apply(state.target_actor, batch.next_observation))
+    next_action = networks_lib.policy(networks, state.target_actor, batch.next_observation)
     next_value = networks.critic.apply(state.target_critic, batch.next_observation, next_action)
     if not state.hparams.bootstrap_at_termination:
         next_value = jnp.where(batch.terminated, 0.0, next_value)
@@ -251,7 +252,7 @@ def actor_loss(
     q = networks.critic.apply(critic, batch.observation, networks.squash(pre_activation))
     loss = -jnp.mean(q) + hparams.pre_activation_penalty * jnp.mean(jnp.square(pre_activation))
     if demonstrations is not None:
-        imitated = networks.squash(networks.actor.apply(actor, demonstrations.observation))
+        imitated = networks_lib.policy(networks, actor, demonstrations.observation)
         error = jnp.mean(jnp.square(imitated - demonstrations.action))
         loss = loss + hparams.behaviour_cloning * error
     return loss, actor

@@ -60,7 +60,7 @@ def returns(demonstrations: Demonstrations) -> np.ndarray:
 
 def subset(
     key: jax.Array,
-    pool: DemonstrationSubset,
+    pool: Demonstrations | DemonstrationSubset,
     n: Numeric,
     size: int | None = None,
 ) -> DemonstrationSubset:
@@ -68,13 +68,15 @@ def subset(
 
     Args:
         key: randomness.
-        pool: the pool's episodes, from `episodes`.
+        pool: the pool; under jit, its `episodes`.
         n: how many; may be traced if `size` is given.
         size: length of the result, of which all but the first `n` are padding. Default `n`.
 
     Raises:
         ValueError: if the pool holds fewer than `n` (or `size`) episodes, or `n` is not positive.
     """
+    if isinstance(pool, Demonstrations):
+        pool = episodes(pool)
     size = size if size is not None else int(n)
     if isinstance(n, int | np.integer) and not 1 <= n <= size:
         raise ValueError(f"n must be between 1 and {size}, got {n}")
@@ -97,18 +99,22 @@ def sample_index(key: jax.Array, subset: DemonstrationSubset, batch_size: int) -
 
 
 def sample(
-    key: jax.Array, pool: Transition, subset: DemonstrationSubset, batch_size: int
+    key: jax.Array,
+    pool: Demonstrations | Transition,
+    subset: DemonstrationSubset,
+    batch_size: int,
 ) -> Transition:
     """A minibatch `[batch_size, ...]` of a subset's steps, uniform with replacement.
 
     Args:
         key: randomness.
-        pool: the pool's transitions, leaves `[N, ...]`.
+        pool: the pool; under jit, its transitions, leaves `[N, ...]`.
         subset: which episodes of it.
         batch_size: how many steps.
     """
+    transition = pool.transition if isinstance(pool, Demonstrations) else pool
     index = sample_index(key, subset, batch_size)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], pool)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], transition)
 
 
 def discounted_returns(demonstrations: Demonstrations, discount: float) -> np.ndarray:

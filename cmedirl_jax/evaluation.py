@@ -53,7 +53,7 @@ def rollout(
         env: the environment.
         params: its parameters.
         starts: states and observations with a leading axis `B`, as `env.starts` gives them.
-        key: for environments that draw in `step`; default a fixed key.
+        key: for environments that draw in `step`; default one fixed key, the same at every call.
     """
     states, observations = starts
     count = observations.shape[0]

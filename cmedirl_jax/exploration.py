@@ -3,7 +3,7 @@
 The paper contradicts itself: Algorithm 2 adds a noise process, section 4.1 is epsilon-greedy. Both
 are here. Every `log_density` is with respect to one base measure: Lebesgue measure inside the
 action bounds, plus a unit mass at each bound of each dimension where clipping puts one, plus (for
-the epsilon-greedy kinds) a unit mass at the greedy action mu(s).
+the epsilon-greedy kind) a unit mass at the greedy action mu(s) and at an action being held.
 """
 
 import math
@@ -66,9 +66,9 @@ class EpsilonGreedyHParams(flax.struct.PyTreeNode):
     """Epsilon-greedy with a linear schedule (the paper, section 4.1)."""
 
     epsilon_start: float = 1.0
-    """Probability of a random action at step 0."""
+    """Probability that a random action begins, at step 0."""
     epsilon_end: float = 0.01
-    """Probability of a random action from `epsilon_steps` on."""
+    """Probability that a random action begins, from `epsilon_steps` on."""
     epsilon_steps: float = 5000.0
     """Environment steps over which epsilon falls linearly."""
     hold: float = 1.0
@@ -92,7 +92,7 @@ class HeldActionState(flax.struct.PyTreeNode):
 
 def gaussian(spec: EnvSpec, hparams: GaussianHParams | None = None) -> Exploration:
     """clip(mu(s) + sigma eps) with eps ~ N(0, I); its state is its hyperparameters."""
-    hparams = _traced(hparams or GaussianHParams())
+    hparams = hparams or GaussianHParams()
 
     def perturb(state: GaussianHParams, action: jax.Array, noise: jax.Array, step: Numeric):
         del step
@@ -101,7 +101,7 @@ def gaussian(spec: EnvSpec, hparams: GaussianHParams | None = None) -> Explorati
         return action, log_density, state
 
     return _exploration(
-        init=lambda key: hparams,
+        init=lambda key: _traced(hparams),
         reset=lambda state: state,
         draw=lambda key: jax.random.normal(key, (spec.action_dim,)),
         perturb=perturb,
@@ -115,11 +115,11 @@ def ornstein_uhlenbeck(
 
     The density is conditional on x_{t-1}.
     """
-    hparams = _traced(hparams or OrnsteinUhlenbeckHParams())
+    hparams = hparams or OrnsteinUhlenbeckHParams()
 
     def init(key: jax.Array) -> OrnsteinUhlenbeckState:
         del key
-        return OrnsteinUhlenbeckState(jnp.zeros(spec.action_dim), hparams)
+        return OrnsteinUhlenbeckState(jnp.zeros(spec.action_dim), _traced(hparams))
 
     def perturb(state: OrnsteinUhlenbeckState, action: jax.Array, noise: jax.Array, step: Numeric):
         del step
@@ -139,15 +139,16 @@ def ornstein_uhlenbeck(
 def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -> Exploration:
     """With probability epsilon a uniform random action, held for `hold` steps; else mu(s).
 
-    The density is conditional on the phase: epsilon / volume where a random action begins,
-    1 / volume while one is held, 1 - epsilon (a mass at mu(s)) where the action is greedy.
+    The density is conditional on the state: epsilon / volume where a random action begins, 1 (a
+    mass) while it is held, 1 - epsilon (a mass at mu(s)) where the action is greedy. So the
+    densities of a trajectory's steps multiply to the trajectory's.
     """
-    hparams = _traced(hparams or EpsilonGreedyHParams())
+    hparams = hparams or EpsilonGreedyHParams()
     log_volume = float(jnp.sum(jnp.log(2.0 * _half_width(spec))))
 
     def init(key: jax.Array) -> HeldActionState:
         del key
-        return HeldActionState(jnp.zeros(spec.action_dim), jnp.zeros(()), hparams)
+        return HeldActionState(jnp.zeros(spec.action_dim), jnp.zeros(()), _traced(hparams))
 
     def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         choice_key, action_key = jax.random.split(key)
@@ -169,7 +170,7 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
         chosen = jnp.where(held, state.action, jnp.where(begins, random_action, action))
         log_density = jnp.where(
             held,
-            -log_volume,
+            0.0,
             jnp.where(begins, jnp.log(epsilon) - log_volume, jnp.log1p(-epsilon)),
         )
         remaining = jnp.where(begins, state.hparams.hold - 1.0, state.remaining - 1.0)

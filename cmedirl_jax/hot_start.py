@@ -34,8 +34,6 @@ class HotStartHParams(flax.struct.PyTreeNode):
     """Adam's rate for both networks."""
     curvature: float = 20.0
     """Of the "quadratic" critic target, per squared half-width of the action range."""
-    discount: float = flax.struct.field(pytree_node=False, default=0.99)
-    """Discount of the returns that the "quadratic" critic target needs."""
     critic: Literal["softmax", "one-hot", "quadratic"] = flax.struct.field(
         pytree_node=False, default="one-hot"
     )
@@ -62,11 +60,18 @@ class HotStartData(NamedTuple):
     episodes: DemonstrationSubset
 
 
-def data(demonstrations: Demonstrations, discount: float) -> HotStartData:
-    """Prepare a pool (on the host, once)."""
+def data(
+    demonstrations: Demonstrations, discount: float = 0.99, reward_scale: float = 1.0
+) -> HotStartData:
+    """Prepare a pool (on the host, once), for an agent of this discount and reward scale.
+
+    The returns are of the environment's reward and end with the demonstration, also where the time
+    limit cut it off.
+    """
+    returns = demonstrations_lib.discounted_returns(demonstrations, discount)
     return HotStartData(
         demonstrations.transition,
-        demonstrations_lib.discounted_returns(demonstrations, discount),
+        (reward_scale * returns).astype(np.float32),
         demonstrations_lib.episodes(demonstrations),
     )
 
@@ -88,7 +93,8 @@ def fit(
         key: randomness of the minibatches.
         networks: whose parameters these are.
         params: `(actor, critic)` to start from.
-        demonstrations: the pool; under jit or vmap, prepare it with `data` first.
+        demonstrations: the pool; prepare it with `data` first under jit or vmap, or for an agent
+            whose discount is not 0.99.
         hparams: hyperparameters.
         subset: the learner's own episodes of the pool; default all.
 
@@ -97,7 +103,7 @@ def fit(
     """
     hparams = hparams or HotStartHParams()
     if isinstance(demonstrations, Demonstrations):
-        demonstrations = data(demonstrations, hparams.discount)
+        demonstrations = data(demonstrations)
     pool = jax.tree.map(jnp.asarray, demonstrations)
     chosen = pool.episodes if subset is None else subset
     optimizer = optax.adam(hparams.learning_rate)

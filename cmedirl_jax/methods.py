@@ -25,7 +25,8 @@ class Method(NamedTuple):
     Attributes:
         name: as the command line and the tables write it.
         description: in a line.
-        hot_start: whether actor and critic start from the demonstrations (Eq. 11).
+        hot_start: whether actor and critic start from the demonstrations (Eq. 11). With
+            `schedule.behaviour_cloning_steps` the actor also goes on imitating them for a while.
         learned_reward: whether r_D is learned (Algorithm 1) and added to r_e (Eq. 10).
     """
 
@@ -44,7 +45,7 @@ METHODS: dict[str, Method] = {
     method.name: method
     for method in (
         Method("ddpg", "DDPG on the environment's reward, no demonstrations"),
-        Method("hs-ddpg", "DDPG, actor and critic hot-started", hot_start=True),
+        Method("hs-ddpg", "DDPG hot-started, then cloning that fades", hot_start=True),
         Method("me-ddpg", "DDPG on r_D + r_e", learned_reward=True),
         Method("hs-me-ddpg", "both (Algorithm 2)", hot_start=True, learned_reward=True),
     )

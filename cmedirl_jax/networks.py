@@ -136,6 +136,11 @@ def make(spec: EnvSpec, architecture: Architecture | None = None) -> ActorCritic
     return ActorCritic(actor(spec, architecture), critic(spec, architecture), squashing(spec), spec)
 
 
+def policy(networks: ActorCritic, actor: Params, observation: jax.Array) -> jax.Array:
+    """mu(s), without noise: observation `[..., O]` -> action `[..., A]`."""
+    return networks.squash(networks.actor.apply(actor, observation))
+
+
 def squashing(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
     """Tanh onto the action bounds: `[..., A]` -> `[..., A]`."""
     centre = jnp.asarray(0.5 * (spec.action_high + spec.action_low))

@@ -47,8 +47,9 @@ class Schedule:
     """Environment steps between updates of actor and critic."""
     target_period: int = 1
     """Environment steps between target updates (the paper: 300, with agent.tau 1)."""
-    behaviour_cloning_steps: int = 4000
-    """Environment steps over which agent.behaviour_cloning falls linearly to 0."""
+    behaviour_cloning_steps: int | None = 4000
+    """Environment steps over which agent.behaviour_cloning of a hot-started method falls linearly
+    to 0; None: no such term."""
 
 
 class Plan(NamedTuple):
@@ -60,7 +61,7 @@ class Plan(NamedTuple):
         update_targets: move the targets at that update.
         learn_reward: update the learned reward.
         reward_weight: weight of r_D beside r_e.
-        cloning_weight: factor on the behaviour-cloning term.
+        cloning_weight: factor on the behaviour-cloning term; 0 where there is none.
     """
 
     step: jax.Array
@@ -83,12 +84,14 @@ def plan(step: jax.Array, schedule: Schedule, reward_schedule: RewardSchedule) -
     return Plan(
         step=step,
         learn=learns & (step % schedule.update_period == 0),
-        # A multiple was passed since the update before this one.
-        update_targets=step // schedule.target_period
-        > (step - schedule.update_period) // schedule.target_period,
+        # True where a multiple was passed since the last update. A period of 1 folds to a constant,
+        # and the branch with it.
+        update_targets=step % schedule.target_period < schedule.update_period,
         learn_reward=learn_reward,
         reward_weight=reward_weight,
-        cloning_weight=_falling(step, schedule.behaviour_cloning_steps),
+        cloning_weight=jnp.zeros_like(step, jnp.float32)
+        if schedule.behaviour_cloning_steps is None
+        else _falling(step, schedule.behaviour_cloning_steps),
     )
 
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from cmedirl_jax import demonstrations as demonstrations_lib
-from cmedirl_jax import hot_start, methods, schedules, updates
+from cmedirl_jax import hot_start, methods, networks, schedules, updates
 from cmedirl_jax.ddpg import DDPGState
 from cmedirl_jax.demonstrations import DemonstrationSubset
 from cmedirl_jax.envs import Env
@@ -275,8 +275,7 @@ def make(
         return jax.lax.scan(body, state, (draws, plans))
 
     def act(params: Any, observation: jax.Array) -> jax.Array:
-        networks = agent.networks
-        return networks.squash(networks.actor.apply(params, observation))
+        return networks.policy(agent.networks, params, observation)
 
     return Trainer(algorithm, init, run, act)
 

@@ -58,19 +58,23 @@ def fit(
         evaluation_starts: start states per evaluation.
 
     Raises:
-        ValueError: for an unknown method, missing demonstrations, or `steps` that are no multiple.
+        ValueError: for an unknown method, missing demonstrations, sizes that are not positive, or
+            `steps` that are no multiple of `evaluate_every`.
     """
     if isinstance(method, str):
         if method not in methods.METHODS:
             raise ValueError(f"unknown method {method!r}; there are: {', '.join(methods.METHODS)}")
         method = methods.METHODS[method]
+    if min(seeds, steps, evaluate_every, evaluation_starts) < 1:
+        raise ValueError("seeds, steps, evaluate_every and evaluation_starts must be positive")
     if steps % evaluate_every:
         raise ValueError(f"steps ({steps}) must be a multiple of evaluate_every ({evaluate_every})")
     settings = settings or Settings()
     data, n = None, 0
     if demonstrations is not None and method.uses_demonstrations:
-        data = hot_start.data(demonstrations, settings.hot_start.discount)
-        n = n_demonstrations or len(data.episodes.start)
+        agent = settings.agent
+        data = hot_start.data(demonstrations, agent.discount, agent.reward_scale)
+        n = len(data.episodes.start) if n_demonstrations is None else n_demonstrations
     trainer = make(env, method, settings, capacity=steps)
 
     def evaluate(state: TrainingState) -> Evaluation:

@@ -48,7 +48,7 @@ class Transition(NamedTuple):
     Attributes:
         observation: `[..., O]` float32.
         action: `[..., A]` float32, inside the action bounds.
-        reward: `[...]` float32, the environment's r_e.
+        reward: `[...]` float32, the environment's r_e (r* in a replay that stores it).
         next_observation: `[..., O]` float32, the true successor, also when the episode was
             truncated (never the first observation of the next episode).
         terminated: `[...]` bool; a time limit is not termination and still bootstraps.

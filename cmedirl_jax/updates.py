@@ -22,7 +22,7 @@ class Draws(NamedTuple):
     Attributes:
         batch: of the agent's, from the replay.
         background: of the reward's, from the replay; empty without a learned reward.
-        demonstrations: rows of the pool, for the reward and for behaviour cloning; may be empty.
+        demonstrations: rows of the pool; the reward and behaviour cloning read the same ones.
     """
 
     batch: jax.Array
@@ -54,7 +54,7 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
     """Make the updates of a method from its parts."""
     agent, learner, _, replay = algorithm
     schedule = settings.reward_schedule
-    clones = method.hot_start and settings.agent.behaviour_cloning > 0
+    clones = method.hot_start and settings.schedule.behaviour_cloning_steps is not None
     stores_shaped = learner is not None and schedule.storage == "store"
     reward_batch = schedule.iterations * schedule.batch_size
     agent_batch = settings.schedule.batch_size

@@ -185,7 +185,8 @@ def _keep_best(best: Any, best_return: jax.Array, actor: Any, returns: jax.Array
 
 @jax.jit
 def _finite(state: TrainingState) -> jax.Array:
-    trained = (state.agent.actor, state.agent.critic, state.reward and state.reward.params)
+    reward = None if state.reward is None else state.reward.params
+    trained = (state.agent.actor, state.agent.critic, reward)
     leaves = [
         jnp.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1)
         for leaf in jax.tree.leaves(trained)

@@ -116,7 +116,7 @@ def return_after_convergence(summary: pl.DataFrame, expert: float | None) -> Fig
         axes.axhline(expert, color="0.4", linestyle="--", linewidth=1, label="demonstrations")
     axes.set(ylabel="average return after convergence")
     _legend(figure, axes)
-    figure.suptitle("Mean over seeds and its 95% interval", fontsize=10)
+    figure.suptitle("Mean over the seeds that converged and its 95% interval", fontsize=10)
     return figure
 
 
@@ -132,18 +132,19 @@ def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None
         label = LABELS.get(method, method)
         if rows["n_demos"].max() == 0:
             axes.axhline(middle[0], color=colour, label=label)
-            axes.axhspan(low[0], high[0], color=colour, alpha=0.15, linewidth=0)
+            if not np.isnan(high[0]):
+                axes.axhspan(low[0], high[0], color=colour, alpha=0.15, linewidth=0)
             continue
         at = positions[np.isin(numbers, rows["n_demos"].to_numpy())]
         offset = 0.06 * (index - (len(methods) - 1) / 2)
         # What was never reached is left out; an arrow stands for an interval without upper bound.
-        unbounded = np.isnan(high)
-        bars = np.array([middle - low, np.where(unbounded, 0.0, high - middle)])
+        unbounded = np.isnan(high) & ~np.isnan(middle)
+        bars = np.array([middle - low, np.where(np.isnan(high), 0.0, high - middle)])
+        axes.plot((at + offset)[unbounded], middle[unbounded], "^", color=colour, markersize=10)
         axes.errorbar(
             at + offset,
             middle,
             bars,
-            lolims=unbounded,
             color=colour,
             marker="o",
             capsize=3,

@@ -1,5 +1,6 @@
 """A whole run: demonstrations, then cell after cell, then the summary and the figures."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from rich.console import Console
 from cmedirl_jax import checkpoint, demonstrations, envs, hot_start, seeds
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
+from cmedirl_jax.methods import Method
 from experiments import (
     cells,
     experts,
@@ -77,91 +79,77 @@ def _train_cells(
     trains_experts = needs_pool and pool is None
     expert_steps = grid.experts.seeds * grid.experts.steps
     total = len(todo) * grid.seeds * budget.max_steps + expert_steps * trains_experts
-    group = seeds.group_size(grid.seeds, len(devices), grid.settings.architecture.hidden)
-    judge = judging.make(env, grid.settings.architecture, group, devices)
-    programs: dict[str, Programs] = {}
     with reporter(console, len(todo) + trains_experts, total) as report:
         if trains_experts:
-            report.start("experts")
-            pool = experts.make_pool(
-                keys.experts,
-                env,
-                grid.experts,
-                grid.expert,
-                devices,
-                _stepwise(report, grid.experts.seeds),
-            )
-        if needs_pool:
-            assert pool is not None
+            report.start(f"experts, {grid.experts.seeds} seeds")
+            advance = _stepwise(report, grid.experts.seeds)
+            pool = experts.make_pool(keys.experts, env, grid.experts, grid.expert, devices, advance)
+        data, metadata = None, {}
+        if pool is not None:
             planning.check_enough(grid, int(pool.episode[-1]) + 1)
+            agent = grid.settings.agent
+            data = hot_start.data(pool, agent.discount, agent.reward_scale)
+            metadata = pool.metadata
         # Only now: a refusal, or a run stopped among the experts, leaves nothing behind.
         folder = results.open_folder(grid)
-        if needs_pool:
-            assert pool is not None
-            if not pool_path.exists():
-                pool_path.parent.mkdir(exist_ok=True)
-                demonstrations.save(pool_path, pool)
+        if pool is not None and not pool_path.exists():
+            pool_path.parent.mkdir(exist_ok=True)
+            demonstrations.save(pool_path, pool)
+        compile_method = _compiler(grid, env, devices, budget)
         for cell in todo:
-            report.start(cell.name)
-            if cell.method.name not in programs:
-                programs[cell.method.name] = cells.compile_method(
-                    env,
-                    cell.method,
-                    grid.settings,
-                    judge,
-                    group=group,
-                    seeds_count=grid.seeds,
-                    devices=devices,
-                    capacity=budget.max_steps,
-                    subset_size=max(grid.n_demos),
-                )
-            _train_cell(
-                grid, env, keys, folder, cell, pool, programs[cell.method.name], budget, report
+            report.start(f"{cell.name}, {grid.seeds} seeds")
+            programs = compile_method(cell.method)
+            result = cells.train(
+                programs,
+                keys.learners,
+                data if cell.n_demos else None,
+                cell.n_demos,
+                seeds_count=grid.seeds,
+                budget=budget,
+                threshold=env.spec.reward_threshold,
+                report=_stepwise(report, grid.seeds),
             )
+            fresh = programs.judge.on_fresh_starts(result.best, keys.fresh_starts, FRESH_STARTS)
+            rows = tables.rows(
+                result,
+                {
+                    "expert": metadata.get("expert", "file") if cell.n_demos else "none",
+                    "method": cell.method.name,
+                    "n_demos": cell.n_demos,
+                },
+                best_return=judging.summarise(fresh).return_mean,
+                replay=gymnasium_replay.replay(programs.judge, result.best, env),
+                expert_steps=metadata.get("expert_env_steps", 0) if cell.n_demos else 0,
+            )
+            checkpoint.save(folder / "policies" / cell.name, result.best)
+            if result.reward is not None:
+                checkpoint.save(folder / "rewards" / cell.name, result.reward)
+            results.append(folder, rows)
 
 
-def _train_cell(
-    grid: Grid,
-    env: Env,
-    keys: Keys,
-    folder: Path,
-    cell: Cell,
-    pool: Demonstrations | None,
-    programs: Programs,
-    budget: Budget,
-    report: Reporter,
-) -> None:
-    data = None
-    if cell.n_demos:
-        assert pool is not None
-        data = hot_start.data(pool, grid.settings.hot_start.discount)
-    result = cells.train(
-        programs,
-        keys.learners,
-        data,
-        cell.n_demos,
-        seeds_count=grid.seeds,
-        budget=budget,
-        threshold=env.spec.reward_threshold,
-        report=_stepwise(report, grid.seeds),
-    )
-    checkpoint.save(folder / "policies" / cell.name, result.best)
-    if result.reward is not None:
-        checkpoint.save(folder / "rewards" / cell.name, result.reward)
-    fresh = programs.judge.on_fresh_starts(result.best, keys.fresh_starts, FRESH_STARTS)
-    metadata = pool.metadata if cell.n_demos and pool is not None else {}
-    rows = tables.rows(
-        result,
-        {
-            "expert": metadata.get("expert", "file") if cell.n_demos else "none",
-            "method": cell.method.name,
-            "n_demos": cell.n_demos,
-        },
-        best_return=judging.summarise(fresh).return_mean,
-        replay=gymnasium_replay.replay(programs.judge, result.best, env),
-        expert_steps=int(metadata.get("expert_env_steps", 0)),
-    )
-    results.append(folder, rows)
+def _compiler(
+    grid: Grid, env: Env, devices: list[jax.Device], budget: Budget
+) -> Callable[[Method], Programs]:
+    """A function that makes each method's programs once, for all numbers of demonstrations."""
+    architecture = grid.settings.architecture
+    group = seeds.group_size(grid.seeds, len(devices), architecture.hidden)
+    judge = judging.make(env, architecture, group, devices)
+
+    @functools.cache
+    def compile_method(method: Method) -> Programs:
+        return cells.compile_method(
+            env,
+            method,
+            grid.settings,
+            judge,
+            group=group,
+            seeds_count=grid.seeds,
+            devices=devices,
+            capacity=budget.max_steps,
+            subset_size=max(grid.n_demos),
+        )
+
+    return compile_method
 
 
 def _reusable(path: Path, env: Env) -> Demonstrations | None:
@@ -208,7 +196,7 @@ def _conclude(
                 of(evaluations, cell),
                 of(seed_rows, cell),
                 env.spec.reward_threshold,
-                episodes_bind=grid.max_steps is None,
+                grid.max_episodes,
             )
             for cell in plan
         ],

@@ -35,7 +35,7 @@ def make(env: Env, architecture: Architecture, group: int, devices: list[jax.Dev
     params = env.default_params
 
     def act(actor: Any, observation: jax.Array) -> jax.Array:
-        return actor_critic.squash(actor_critic.actor.apply(actor, observation))
+        return networks.policy(actor_critic, actor, observation)
 
     def on_starts(actors: Any, count: int) -> Rollouts:
         return spread(actors, env.starts(count, params))
@@ -63,10 +63,4 @@ def make(env: Env, architecture: Architecture, group: int, devices: list[jax.Dev
 
 def summarise(rollouts: Rollouts) -> Evaluation:
     """Each seed's statistics over its starts, `[seeds]`, on the host."""
-    returns = np.asarray(rollouts.episode_return)
-    return Evaluation(
-        return_mean=returns.mean(axis=1),
-        return_std=returns.std(axis=1),
-        goal_fraction=np.asarray(rollouts.terminated, np.float32).mean(axis=1),
-        length_mean=np.asarray(rollouts.length, np.float32).mean(axis=1),
-    )
+    return jax.tree.map(np.asarray, jax.vmap(evaluation.summarise)(rollouts))

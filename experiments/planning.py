@@ -79,7 +79,7 @@ def check(grid: Grid) -> None:
         check_enough(grid, grid.experts.trajectories)
 
 
-def _positive(grid: Grid) -> list[tuple[str, int | None]]:
+def _positive(grid: Grid) -> list[tuple[str, float | None]]:
     """Options that must be positive."""
     settings = grid.settings
     named = [("n_demos", number) for number in grid.n_demos]
@@ -114,7 +114,12 @@ def _positive(grid: Grid) -> list[tuple[str, int | None]]:
             settings.reward_schedule,
             ("period", "iterations", "anneal_steps", "batch_size", "recent"),
         ),
-        ("hot_start", settings.hot_start, ("cells", "batch_size")),
+        ("hot_start", settings.hot_start, ("steps", "cells", "batch_size")),
+        (
+            "exploration.epsilon-greedy",
+            settings.exploration.epsilon_greedy,
+            ("epsilon_steps", "hold"),
+        ),
     ]
     for prefix, options, names in groups:
         named += [(f"{prefix}.{name}", getattr(options, name)) for name in names]

@@ -58,7 +58,7 @@ class Grid:
     expert: Expert = "best"
     """Who demonstrates: the best or median expert that solved the task, or all of them alike."""
     demos: Path | None = None
-    """A demonstrations file to learn from, instead of experts trained for this run."""
+    """A demonstrations file to learn from; no experts are trained, their options say nothing."""
     env: str = "MountainCarContinuous-v0"
     """The environment, by Gymnasium's name."""
     devices: int | None = None
@@ -79,7 +79,6 @@ _PAPER_SETTINGS = Settings(
         actor_learning_rate=1e-5,
         critic_learning_rate=1e-5,
         pre_activation_penalty=0.0,
-        behaviour_cloning=0.0,
         bootstrap_at_termination=True,
     ),
     exploration=ExplorationSettings(kind="epsilon-greedy"),
@@ -88,7 +87,9 @@ _PAPER_SETTINGS = Settings(
     ),
     reward_schedule=RewardSchedule(period=1, stop=None, recent=None, storage="store"),
     hot_start=HotStartHParams(critic="softmax"),
-    schedule=Schedule(replay_capacity=10_000, learning_starts=0, target_period=300),
+    schedule=Schedule(
+        replay_capacity=10_000, learning_starts=0, target_period=300, behaviour_cloning_steps=None
+    ),
 )
 
 PRESETS: dict[str, Grid] = {

@@ -50,6 +50,8 @@ def check_folder(grid: Grid) -> None:
     try:
         if path.exists():
             _compare(path, describe(grid))
+        elif any((folder / f"{name}.parquet").exists() for name in TABLES):
+            raise UserError(f"--out: {folder} holds tables without their config.json")
         nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
         with tempfile.TemporaryFile(dir=nearest):
             pass

@@ -27,13 +27,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not console.is_terminal:
         console = Console(width=120)
     try:
-        planning.check(grid)
+        # Before anything else: the first array that JAX makes fixes the number of CPU devices.
         devices = start_devices(grid)
+        planning.check(grid)
+        kind = devices[0].platform.upper()
+        console.print(f"{grid.seeds} seeds per cell on {len(devices)} {kind} device(s)")
         summary = grid_lib.run(grid, devices, console)
     except UserError as error:
         print(f"run_grid: {error}", file=sys.stderr)
         return 2
     console.print(summary_table(summary))
+    difference = summary["gymnasium_difference_max"].max()
+    console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
+    if summary["diverged"].sum():
+        console.print(f"Seeds that diverged and were stopped: {summary['diverged'].sum()}")
     console.print(f"Tables and figures: {grid.folder}", highlight=False, soft_wrap=True)
     return 0
 
@@ -62,7 +69,7 @@ def start_devices(grid: Grid) -> list[jax.Device]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     # A device wants a few seeds to itself: fewer than four a device do not fill a vector unit.
     wanted = grid.devices or max(1, min(cores or 1, grid.seeds // 4))
-    if grid.devices is None or grid.devices <= (cores or 1):
+    if grid.devices is None or 1 <= grid.devices <= (cores or 1):
         # Once JAX has started (a second call in one process) it keeps the devices it has.
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", wanted)
@@ -70,7 +77,7 @@ def start_devices(grid: Grid) -> list[jax.Device]:
     available = len(devices) if devices[0].platform != "cpu" else cores or 1
     if grid.devices is not None and grid.devices > available:
         raise UserError(f"--devices: {grid.devices} asked, there are {available}")
-    return devices[: grid.devices]
+    return devices[: max(grid.devices, 1)] if grid.devices is not None else devices
 
 
 def summary_table(summary: pl.DataFrame) -> Table:

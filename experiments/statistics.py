@@ -2,8 +2,9 @@
 
 Every interval is a 95% one over seeds: Clopper-Pearson for shares, order statistics for medians, a
 percentile bootstrap for means. A seed that never reached the threshold counts as +infinity in a
-median; it is never dropped. A seed that diverged is judged by its evaluations until then, and does
-not count as sustained.
+median; it is never dropped. A seed that diverged stands at the lowest return it ever had for every
+evaluation that it misses. The intervals speak of the learners' seeds alone: all of them learn from
+one pool of demonstrations, made by one set of experts.
 """
 
 from typing import Any, NamedTuple
@@ -41,7 +42,7 @@ class SeedStatistics(NamedTuple):
         sustained: it converged, and every later evaluation is at the threshold too.
         dip_fraction: share of the evaluations after the first at the threshold that fall below it;
             NaN if it never converged or nothing came after.
-        area: mean return over the evaluations.
+        area: mean return over the evaluations, each counted alike.
         final_return: of the last evaluation.
         return_after_convergence: mean return from convergence on; NaN if it never converged.
     """
@@ -55,10 +56,14 @@ class SeedStatistics(NamedTuple):
     return_after_convergence: float
 
 
-def seed_statistics(curve: SeedCurve, threshold: float) -> SeedStatistics:
-    """Reduce one seed's curve."""
-    reached = curve.return_mean >= threshold
-    area, final = float(curve.return_mean.mean()), float(curve.return_mean[-1])
+def seed_statistics(curve: SeedCurve, threshold: float, missing: int = 0) -> SeedStatistics:
+    """Reduce one seed's curve, of which the last `missing` evaluations were lost to divergence."""
+    floor = np.full(missing, curve.return_mean.min())
+    returns = np.concatenate([curve.return_mean, floor])
+    reached = returns >= threshold
+    # Once diverged, a policy that always solved the task does so no more.
+    reached[returns.size - missing :] = False
+    area, final = float(returns.mean()), float(returns[-1])
     if not reached.any():
         return SeedStatistics(np.inf, np.inf, False, np.nan, area, final, np.nan)
     first = int(np.argmax(reached))
@@ -70,7 +75,7 @@ def seed_statistics(curve: SeedCurve, threshold: float) -> SeedStatistics:
         dip_fraction=float(1.0 - after.mean()) if after.size else np.nan,
         area=area,
         final_return=final,
-        return_after_convergence=float(curve.return_mean[first:].mean()),
+        return_after_convergence=float(returns[first:].mean()),
     )
 
 
@@ -132,7 +137,7 @@ def curves(evaluations: pl.DataFrame) -> dict[int, SeedCurve]:
 
 
 def summarise(
-    evaluations: pl.DataFrame, seeds: pl.DataFrame, threshold: float, *, episodes_bind: bool
+    evaluations: pl.DataFrame, seeds: pl.DataFrame, threshold: float, max_episodes: int | None
 ) -> dict[str, Any]:
     """One row of summary.csv: a cell's statistics over its seeds.
 
@@ -140,35 +145,48 @@ def summarise(
         evaluations: the cell's rows of evaluations.parquet.
         seeds: the cell's rows of seeds.parquet.
         threshold: the return that counts as solved.
-        episodes_bind: the run ended each seed after a number of episodes, so that means over
-            episodes are those of comparable runs.
+        max_episodes: of the run.
     """
-    found = [seed_statistics(curve, threshold) for curve in curves(evaluations).values()]
+    by_seed = curves(evaluations)
+    diverged = seeds["diverged"].to_numpy()
+    longest = max(curve.return_mean.size for curve in by_seed.values())
+    found = [
+        seed_statistics(
+            curve, threshold, missing=longest - curve.return_mean.size if diverged[seed] else 0
+        )
+        for seed, curve in by_seed.items()
+    ]
     columns = SeedStatistics(*(np.array(column, float) for column in zip(*found, strict=True)))
     converged = np.isfinite(columns.convergence_env_step)
     first = evaluations.row(0, named=True)
     dips = columns.dip_fraction[~np.isnan(columns.dip_fraction)]
     after = columns.return_after_convergence[converged]
     best = seeds["best_return"].to_numpy()
-    diverged = seeds["diverged"].to_numpy()
     row: dict[str, Any] = {
         **{name: first[name] for name in ("expert", "method", "n_demos")},
         "seeds": len(found),
         **_named("converged_fraction", share(converged)),
         **_named("convergence_env_step_median", _from_zero(median(columns.convergence_env_step))),
-        **_named("convergence_episode_median", _from_zero(median(columns.convergence_episode))),
     }
-    # Under a budget of steps a failing seed lives fewer episodes than a succeeding one: a mean over
-    # episodes then says something only if no seed failed.
-    comparable = bool(converged.all()) or episodes_bind
-    restricted = np.where(converged, columns.convergence_episode, seeds["episodes"].to_numpy())
+    # Under a budget of steps a failing seed lives fewer episodes than a succeeding one: statistics
+    # over episodes then say something only if no seed failed.
+    lived = seeds.filter(~pl.col("diverged"))["episodes"]
+    comparable = bool(converged.all()) or (
+        max_episodes is not None and bool((lived == max_episodes).all())
+    )
+    restricted = np.where(converged, columns.convergence_episode, float(max_episodes or 0))
     row |= {
+        **(
+            _named("convergence_episode_median", _from_zero(median(columns.convergence_episode)))
+            if comparable
+            else _empty("convergence_episode_median")
+        ),
         "convergence_episode_mean": float(restricted.mean()) if comparable else None,
         "convergence_episode_std": float(restricted.std(ddof=1))
         if comparable and restricted.size > 1
         else None,
         "convergence_episode_restricted": not bool(converged.all()),
-        **_named("sustained_fraction", share(columns.sustained.astype(bool) & ~diverged)),
+        **_named("sustained_fraction", share(columns.sustained.astype(bool))),
         **(_named("dip_fraction", mean(dips)) if dips.size else _empty("dip_fraction")),
         **_named("area", mean(columns.area)),
         "final_return_mean": float(columns.final_return.mean()),

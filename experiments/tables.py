@@ -73,7 +73,7 @@ def rows(
                 "env_steps": result.env_steps.astype(np.int32),
                 "episodes": finished,
                 "demonstration_steps": result.demonstration_steps.astype(np.int32),
-                "expert_steps": np.full(count, expert_steps, np.int32),
+                "expert_steps": np.full(count, expert_steps, np.int64),
                 "diverged": result.diverged,
                 "best_return": best_return.astype(np.float32),
                 "gymnasium_return": replay.gymnasium_return.mean(axis=1),

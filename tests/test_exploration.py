@@ -195,7 +195,7 @@ def test_random_actions_are_held_for_exactly_hold_steps(hold):
         log_densities.append(float(log_density))
     assert actions == [2.0] * hold + [0.0] * 2
     log_volume = math.log(HIGH - LOW)
-    expected = [math.log(0.505) - log_volume] + [-log_volume] * (hold - 1) + [math.log(0.495)] * 2
+    expected = [math.log(0.505) - log_volume] + [0.0] * (hold - 1) + [math.log(0.495)] * 2
     np.testing.assert_allclose(log_densities, expected, rtol=1e-5)
 
 

@@ -49,7 +49,7 @@ def test_paper_is_the_papers_letter():
     assert settings.schedule.replay_capacity == 10_000
     assert (settings.schedule.target_period, agent.tau) == (300, 1.0)
     assert agent.bootstrap_at_termination
-    assert agent.behaviour_cloning == agent.pre_activation_penalty == 0.0
+    assert agent.pre_activation_penalty == 0.0
     assert exploration.kind == "epsilon-greedy"
     epsilon = exploration.epsilon_greedy
     assert (epsilon.epsilon_start, epsilon.epsilon_end, epsilon.epsilon_steps) == (1.0, 0.01, 5_000)

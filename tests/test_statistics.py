@@ -172,7 +172,7 @@ def test_summary_of_a_cell_by_hand():
         evaluations_of([0, 92, 80], [95, 95, 95], [0, 0, 94]),
         seeds_of(3),
         90.0,
-        episodes_bind=False,
+        max_episodes=None,
     )
     expected = {
         "expert": "best",
@@ -207,7 +207,7 @@ def test_summary_of_a_cell_by_hand():
 
 def test_what_never_happened_is_empty_and_every_number_in_the_summary_is_finite():
     row = statistics.summarise(
-        evaluations_of([0, 0, 0], [1, 2, 3]), seeds_of(2), 90.0, episodes_bind=False
+        evaluations_of([0, 0, 0], [1, 2, 3]), seeds_of(2), 90.0, max_episodes=None
     )
     for name in (
         "convergence_env_step_median",
@@ -222,20 +222,47 @@ def test_what_never_happened_is_empty_and_every_number_in_the_summary_is_finite(
 
 
 def test_one_seed_has_no_standard_deviation():
-    row = statistics.summarise(evaluations_of([0, 92]), seeds_of(1), 90.0, episodes_bind=False)
+    row = statistics.summarise(evaluations_of([0, 92]), seeds_of(1), 90.0, max_episodes=None)
     for name in ("convergence_episode_std", "final_return_std", "best_return_std"):
         assert row[name] is None, name
 
 
-def test_mean_over_episodes_is_restricted_where_episodes_bind_and_missing_where_steps_do():
-    tables = evaluations_of([0, 92, 92], [0, 0, 0]), seeds_of(2)
-    by_episodes = statistics.summarise(*tables, 90.0, episodes_bind=True)
-    by_steps = statistics.summarise(*tables, 90.0, episodes_bind=False)
+def test_statistics_over_episodes_are_restricted_where_episodes_bind_and_missing_where_steps_do():
+    evaluations = evaluations_of([0, 92, 92], [0, 0, 0])
+    seeds = seeds_of(2, episodes=[8, 8])
+    by_episodes = statistics.summarise(evaluations, seeds, 90.0, max_episodes=8)
     assert by_episodes["convergence_episode_restricted"]
-    assert by_steps["convergence_episode_restricted"]
-    # The failing seed counts with the 8 episodes that it lived.
     assert by_episodes["convergence_episode_mean"] == pytest.approx((2 + 8) / 2)
-    assert by_steps["convergence_episode_mean"] is None
+    assert by_episodes["convergence_episode_median"] == 2.0
+    # The steps ran out first.
+    by_steps = statistics.summarise(evaluations, seeds, 90.0, max_episodes=9)
+    assert by_steps["convergence_episode_restricted"]
+    for name in ("mean", "median", "median_low", "median_high"):
+        assert by_steps[f"convergence_episode_{name}"] is None
+
+
+def test_a_diverged_seed_is_no_fast_one():
+    """It is restricted at the run's episodes, not at those that it lived."""
+    row = statistics.summarise(
+        evaluations_of([0, 0, 92], [0]),
+        seeds_of(2, episodes=[100, 2], diverged=[False, True]),
+        90.0,
+        max_episodes=100,
+    )
+    assert row["convergence_episode_mean"] == pytest.approx((4 + 100) / 2)
+
+
+def test_a_diverged_seed_stands_at_its_lowest_return_from_then_on():
+    row = statistics.summarise(
+        evaluations_of([95, 95, 95, 95], [91, 95]),
+        seeds_of(2, diverged=[False, True]),
+        90.0,
+        max_episodes=None,
+    )
+    assert row["final_return_mean"] == pytest.approx((95 + 91) / 2)
+    assert row["area"] == pytest.approx((95 + (91 + 95 + 91 + 91) / 4) / 2)
+    # Of three evaluations after the first it misses two.
+    assert row["dip_fraction"] == pytest.approx(2 / 3 / 2)
 
 
 def test_diverged_seeds_are_counted_and_kept():
@@ -243,7 +270,7 @@ def test_diverged_seeds_are_counted_and_kept():
         evaluations_of([0, 92, 92], [0]),
         seeds_of(2, diverged=[False, True]),
         90.0,
-        episodes_bind=False,
+        max_episodes=None,
     )
     assert row["diverged"] == 1
     assert row["seeds"] == 2
@@ -255,7 +282,7 @@ def test_a_seed_that_diverged_after_it_converged_is_not_sustained():
         evaluations_of([95, 95], [95]),
         seeds_of(2, diverged=[False, True]),
         90.0,
-        episodes_bind=False,
+        max_episodes=None,
     )
     assert row["converged_fraction"] == 1.0
     assert row["sustained_fraction"] == 0.5

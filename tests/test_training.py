@@ -204,7 +204,7 @@ def test_the_learned_reward_reaches_the_critic():
 def test_the_behaviour_cloning_term_fades_out():
     faded = with_(agent={"behaviour_cloning": 5.0}, schedule={"behaviour_cloning_steps": 1})
     cloning = with_(agent={"behaviour_cloning": 5.0})
-    without = with_(agent={"behaviour_cloning": 0.0})
+    without = with_(schedule={"behaviour_cloning_steps": None})
     actors = []
     for settings in (faded, without, cloning):
         _, state, advance = start("hs-ddpg", settings)

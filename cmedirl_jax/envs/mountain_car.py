@@ -3,7 +3,7 @@
 Source: Gymnasium 1.4.0, `gymnasium/envs/classic_control/continuous_mountain_car.py`. Two details
 that other ports miss: the *force* uses the clipped action while the *cost* uses the action as
 given, and the velocity is zeroed at the left wall (not at the goal). Gymnasium evaluates the cosine
-in double precision; this version is float32 throughout and agrees to 1e-7 per step.
+in double precision; this version is float32 throughout and agrees within float32 rounding.
 """
 
 import flax.struct

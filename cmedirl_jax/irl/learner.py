@@ -68,7 +68,7 @@ class UpdateFn(Protocol):
         *,
         key: jax.Array | None = None,
     ) -> tuple[RewardState, RewardInfo]:
-        """Ascend L(theta) = log P(D | r_theta) + log P(theta).
+        """Take a step along the sampled estimate of dL/dtheta, L = log P(D | r) + log P(theta).
 
         Args:
             state: the state before.

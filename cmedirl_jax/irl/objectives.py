@@ -9,6 +9,11 @@ def visitation_difference(
 ) -> tuple[jax.Array, jax.Array]:
     """dL_D/dr = mu_D - E[mu] on the sampled state-action pairs (Eq. 6, Eq. 8).
 
+    An estimate, undiscounted. The background samples stand in for those of the soft-optimal policy
+    of the current reward, without importance weights, which biases it; and weights that are linear
+    in the reward have no partition function to hold the reward back, which is why `IRLHParams` has
+    a bound and a penalty.
+
     mu_D is the empirical distribution of the demonstration batch. E[mu] is estimated by that of the
     background batch: the demonstrations together with the samples where `append` (Algorithm 1, line
     4), or the samples alone. With these uniform weights the two differ only in the factor
