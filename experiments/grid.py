@@ -59,6 +59,8 @@ def run(grid: Grid, devices: list[jax.Device], console: Console) -> pl.DataFrame
     done = results.finished(folder)
     todo = [cell for cell in plan if (cell.method.name, cell.n_demos) not in done]
     if todo:
+        kind = devices[0].platform.upper()
+        console.print(f"{grid.seeds} seeds per cell on {len(devices)} {kind} device(s)")
         _train_cells(grid, env, keys, given, todo, devices, console)
     return _conclude(grid, env, folder, plan, redraw=bool(todo))
 

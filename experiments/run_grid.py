@@ -30,8 +30,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Before anything else: the first array that JAX makes fixes the number of CPU devices.
         devices = start_devices(grid)
         planning.check(grid)
-        kind = devices[0].platform.upper()
-        console.print(f"{grid.seeds} seeds per cell on {len(devices)} {kind} device(s)")
         summary = grid_lib.run(grid, devices, console)
     except UserError as error:
         print(f"run_grid: {error}", file=sys.stderr)

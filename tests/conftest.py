@@ -13,10 +13,9 @@ hypothesis.settings.load_profile("reproducible")
 
 @pytest.fixture(autouse=True)
 def quick_compilation(request):
-    """Most tests compile for longer than they run; those that train many seeds do not."""
-    jax.config.update(
-        "jax_disable_most_optimizations", request.node.get_closest_marker("statistical") is None
-    )
+    """Most tests compile for longer than they run; the marked ones run as a user's program does."""
+    optimised = [request.node.get_closest_marker(name) for name in ("statistical", "optimised")]
+    jax.config.update("jax_disable_most_optimizations", not any(optimised))
 
 
 @pytest.fixture(scope="session")

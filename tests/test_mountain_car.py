@@ -18,6 +18,8 @@ KEY = jax.random.key(0)
 step = jax.jit(ENV.step)
 step_many = jax.jit(jax.vmap(ENV.step, in_axes=(None, 0, 0, None)))
 
+pytestmark = pytest.mark.optimised
+
 
 @pytest.fixture(scope="module")
 def car():

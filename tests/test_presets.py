@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from cmedirl_jax import envs, methods
-from cmedirl_jax.methods import METHODS
+from cmedirl_jax.methods import METHODS, Settings
 from experiments import planning
 from experiments.presets import PRESETS
 from experiments.run_grid import parse
@@ -134,3 +134,8 @@ def test_what_tyro_finds_keeps_its_form(arguments, capsys):
         parse(arguments)
     assert error.value.code == 2
     assert arguments[0] in capsys.readouterr().err
+
+
+def test_the_librarys_defaults_are_the_tuned_preset():
+    """What the learning tests train is what the command trains."""
+    assert PRESETS["tuned"].settings == Settings()

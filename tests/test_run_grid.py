@@ -252,6 +252,8 @@ def test_a_run_leaves_what_the_design_lists_and_nothing_unfinished(smoke):
     }
     assert json.loads((folder / "config.json").read_text())["config"]["seeds"] == SEEDS
     assert "[1/5] experts" in done.stdout
+    # Any array made before the devices are started would leave one.
+    assert f"on {min(os.cpu_count(), 2)} CPU device(s)" in done.stdout
     assert str(folder) in done.stdout
 
 
@@ -351,3 +353,19 @@ def test_a_run_cut_off_between_cells_resumes_to_the_same_tables(smoke, compiled,
     for name in TABLES:
         assert_frame_equal(pl.read_parquet(folder / name), pl.read_parquet(smoke[0] / name))
     assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="there is one core")
+def test_seeds_do_not_depend_on_the_devices_that_share_them(tmp_path, compiled):
+    returns = []
+    for devices in (1, 2):
+        out = tmp_path / str(devices)
+        size = ("--seeds", 9, "--max-steps", 300, "--architecture.hidden", 8)
+        done = run_command(
+            "--methods", "ddpg", *size, "--devices", devices, "--out", out, **compiled
+        )
+        assert done.returncode == 0, done.stderr
+        assert f"9 seeds per cell on {devices} CPU device(s)" in done.stdout
+        returns.append(pl.read_parquet(out / "evaluations.parquet")["return_mean"].to_numpy())
+    assert returns[0].size == 9 * 3
+    np.testing.assert_allclose(*returns, rtol=1e-3, atol=1e-3)
