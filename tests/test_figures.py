@@ -66,7 +66,7 @@ def run(cells, seeds=3):
                 evaluations.filter(pl.col("method") == method, pl.col("n_demos") == n_demos),
                 per_seed,
                 THRESHOLD,
-                episodes_bind=False,
+                max_episodes=None,
             )
             for method, n_demos in cells
         ],

@@ -24,10 +24,7 @@ def test_tuned_ddpg_solves_the_task():
 
 @pytest.mark.statistical
 def test_a_hot_start_solves_the_task_before_the_first_step():
-    fit = jax.jit(
-        lambda key: training.fit(
-            key, pools.ENV, "hs-me-ddpg", pools.scripted(), seeds=32, steps=250
-        )
-    )
+    pool = pools.scripted()
+    fit = jax.jit(lambda key: training.fit(key, pools.ENV, "hs-me-ddpg", pool, seeds=32, steps=250))
     returns = np.asarray(fit(jax.random.key(0)).evaluations.return_mean)
     assert np.mean(returns[:, 0] >= SOLVED) >= 0.85

@@ -23,9 +23,8 @@ SCHEMAS = {
         "terminated": pl.Boolean,
     },
     "seeds": {
-        **dict.fromkeys(
-            ("seed", "env_steps", "episodes", "demonstration_steps", "expert_steps"), pl.Int32
-        ),
+        **dict.fromkeys(("seed", "env_steps", "episodes", "demonstration_steps"), pl.Int32),
+        "expert_steps": pl.Int64,
         "diverged": pl.Boolean,
         "best_return": pl.Float32,
         **dict.fromkeys(("gymnasium_return", "gymnasium_difference"), pl.Float64),
