@@ -100,11 +100,13 @@ def convergence(summary: pl.DataFrame) -> Figure:
     """Figure 4: episodes and environment steps until convergence, over N_T."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     _over_demonstrations(left, summary, "convergence_episode_median")
-    left.set(ylabel="episodes until convergence (median)")
+    left.set(ylabel="median episodes")
     _over_demonstrations(right, summary, "convergence_env_step_median")
-    right.set(ylabel="environment steps until convergence (median)")
+    right.set(ylabel="median environment steps")
     _legend(figure, left)
-    figure.suptitle("First evaluation at the reward threshold; 95% intervals", fontsize=10)
+    figure.suptitle(
+        "Until convergence: first evaluation at the reward threshold; 95% intervals", fontsize=10
+    )
     return figure
 
 
