@@ -84,8 +84,7 @@ def plan(step: jax.Array, schedule: Schedule, reward_schedule: RewardSchedule) -
     return Plan(
         step=step,
         learn=learns & (step % schedule.update_period == 0),
-        # True where a multiple was passed since the last update. A period of 1 folds to a constant,
-        # and the branch with it.
+        # True where a multiple was passed since the last update.
         update_targets=step % schedule.target_period < schedule.update_period,
         learn_reward=learn_reward,
         reward_weight=reward_weight,

@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
+import jax.extend.core
+import jax.numpy as jnp
 import numpy as np
 
 State = TypeVar("State")
@@ -52,15 +54,75 @@ def map_groups(function: Callable[..., State], group: int) -> Callable[..., Stat
     """
 
     def mapped(states, *shared):
-        count = jax.tree.leaves(states)[0].shape[0]
-        if count % group:
-            raise ValueError(f"{count} seeds are not whole groups of {group}")
+        count = _whole_groups(states, group)
         grouped = jax.tree.map(lambda x: x.reshape(count // group, group, *x.shape[1:]), states)
         vmapped = jax.vmap(function, in_axes=(0, *(None for _ in shared)))
         result = jax.lax.map(lambda states: vmapped(states, *shared), grouped)
         return jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), result)
 
     return mapped
+
+
+def step_groups(
+    function: Callable[..., tuple[State, Any]], group: int
+) -> Callable[..., tuple[State, Any]]:
+    """Like `map_groups`, for the first groups alone and in place.
+
+    How many groups is traced, so that seeds which have finished cost nothing once they lie behind
+    those which have not. Under `jit` with the states donated, no second copy of them is held.
+
+    Args:
+        function: `(seed_state, *shared) -> (seed_state, output)`.
+        group: seeds per `vmap`; must divide the number of seeds.
+
+    Returns:
+        `(states, groups [] int32, *shared) -> (states, outputs)`. The seeds past the first `groups`
+        groups keep their states, and their outputs are zeros.
+    """
+
+    def mapped(states, groups, *shared):
+        count = _whole_groups(states, group)
+        vmapped = jax.vmap(function, in_axes=(0, *(None for _ in shared)))
+
+        def block(states, index):
+            return jax.tree.map(
+                lambda x: jax.lax.dynamic_slice_in_dim(x, index * group, group), states
+            )
+
+        def put(whole, part, index):
+            return jax.tree.map(
+                lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, index * group, axis=0),
+                whole,
+                part,
+            )
+
+        # Traced once, though its shapes are needed before the loop: tracing takes seconds.
+        jaxpr, shapes = jax.make_jaxpr(vmapped, return_shape=True)(block(states, 0), *shared)
+        step = jax.extend.core.jaxpr_as_fun(jaxpr)
+
+        def body(index, carry):
+            states, outputs = carry
+            flat = step(*jax.tree.leaves((block(states, index), *shared)))
+            stepped, output = jax.tree.unflatten(jax.tree.structure(shapes), flat)
+            return put(states, stepped, index), put(outputs, output, index)
+
+        outputs = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes[1])
+        return jax.lax.fori_loop(0, groups, body, (states, outputs))
+
+    return mapped
+
+
+def _whole_groups(states: Any, group: int) -> int:
+    count = jax.tree.leaves(states)[0].shape[0]
+    if count % group:
+        raise ValueError(f"{count} seeds are not whole groups of {group}")
+    return count
+
+
+def sharding(devices: Sequence[Any]) -> jax.sharding.NamedSharding:
+    """The leading axis split over `devices`, as `map_devices` leaves it."""
+    mesh = jax.sharding.Mesh(np.asarray(devices), ("seeds",))
+    return jax.sharding.NamedSharding(mesh, jax.P("seeds"))
 
 
 def map_devices(function: Callable[..., State], devices: Sequence[Any]) -> Callable[..., State]:
@@ -70,13 +132,12 @@ def map_devices(function: Callable[..., State], devices: Sequence[Any]) -> Calla
         function: maps a block of seeds, as `map_groups` returns it.
         devices: each takes an equal share; their number must divide the number of seeds.
     """
-    mesh = jax.sharding.Mesh(np.asarray(devices), ("seeds",))
     split, shared_spec = jax.P("seeds"), jax.P()
 
     def mapped(states, *shared):
         return jax.shard_map(
             function,
-            mesh=mesh,
+            mesh=sharding(devices).mesh,
             in_specs=(split, *(shared_spec for _ in shared)),
             out_specs=split,
             check_vma=False,

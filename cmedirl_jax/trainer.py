@@ -102,10 +102,10 @@ class Trainer(NamedTuple):
 
 
 class _Draws(NamedTuple):
-    """All randomness of a step."""
+    """All randomness of a step; `reset` is the start of the next episode, should this one end."""
 
     env: jax.Array
-    reset: jax.Array
+    reset: tuple[Any, jax.Array]
     noise: Any
     updates: Draws
 
@@ -179,7 +179,7 @@ def make(
         keys = jax.random.split(jax.random.fold_in(key, step), 4)
         return _Draws(
             env=keys[0],
-            reset=keys[1],
+            reset=env.reset(keys[1], env_params),
             noise=exploration.draw(keys[2]),
             updates=update.draw(keys[3], subset),
         )
@@ -242,7 +242,7 @@ def make(
             critic_loss=critic_loss,
             q_mean=q_mean,
         )
-        fresh_env, fresh_observation = env.reset(draws.reset, env_params)
+        fresh_env, fresh_observation = draws.reset
         state = state.replace(
             agent=agent_state,
             reward=reward_state,

@@ -16,6 +16,7 @@ from cmedirl_jax.training import Log, TrainingState
 from experiments import judging
 from experiments.bookkeeping import Book, Budget, EpisodeRows, EvaluationRows
 from experiments.judging import Judge
+from experiments.lanes import Lanes
 
 CHUNK = 250
 """Steps per call of the compiled training loop, and so between looks at the seeds from the host."""
@@ -56,16 +57,23 @@ class Programs(NamedTuple):
     """The compiled functions of a method. Every cell of the method uses the same ones.
 
     Attributes:
-        init: `(keys [padded], data, n_demonstrations) -> TrainingState` `[padded, ...]`.
-        run: `(state, data, steps, max_episodes) -> (TrainingState, Log)`; the state is donated.
+        init: `(keys [lanes], groups, data, n_demonstrations) -> TrainingState` `[lanes, ...]`.
+        run: `(state, groups, data, steps, max_episodes) -> (TrainingState, Log)`; the state is
+            donated. Only the first `groups` groups of lanes on each device move.
+        permute: `(state, move [lanes]) -> TrainingState`; lane i takes lane move[i]'s. Donated too.
         judge: noise-free rollouts.
-        padded: seeds that fill whole groups on every device; those past the cell's are ignored.
+        lanes: how many seeds fit in.
+        group: lanes that are stepped together on a device.
+        devices: devices that share the lanes.
     """
 
     init: Callable[..., TrainingState]
     run: Callable[..., tuple[TrainingState, Log]]
+    permute: Callable[[TrainingState, np.ndarray], TrainingState]
     judge: Judge
-    padded: int
+    lanes: int
+    group: int
+    devices: int
 
 
 def compile_method(
@@ -84,13 +92,23 @@ def compile_method(
     trainer = training.make(env, method, settings, capacity=capacity, subset_size=subset_size)
 
     def spread(function: Callable) -> Callable:
-        return seeds.map_devices(seeds.map_groups(function, group), devices)
+        return seeds.map_devices(seeds.step_groups(function, group), devices)
+
+    def init(keys: jax.Array, groups: int, data: HotStartData | None, n_demonstrations: int):
+        initial = spread(lambda key, *shared: (key, trainer.init(key, *shared)))
+        return initial(keys, groups, data, n_demonstrations)[1]
+
+    def permute(state: TrainingState, move: np.ndarray) -> TrainingState:
+        return jax.tree.map(lambda leaf: leaf[move], state)
 
     return Programs(
-        init=jax.jit(spread(trainer.init)),
+        init=jax.jit(init),
         run=jax.jit(spread(trainer.run), donate_argnums=0),
+        permute=jax.jit(permute, donate_argnums=0, out_shardings=seeds.sharding(devices)),
         judge=judge,
-        padded=seeds.padded(seeds_count, group, len(devices)),
+        lanes=seeds.padded(seeds_count, group, len(devices)),
+        group=group,
+        devices=len(devices),
     )
 
 
@@ -106,60 +124,66 @@ def train(
     report: Callable[[Progress], None],
 ) -> CellResult:
     """Train a cell on `data` (None for a method without demonstrations), reporting each chunk."""
-    keys = seeds.keys(key, programs.padded)
-    state = programs.init(keys, data, n_demos)
-    actor = state.agent.actor
+    lanes = Lanes(programs.lanes, seeds_count, programs.group, programs.devices)
+    groups = lanes.groups(np.ones(seeds_count, bool))
+    keys = seeds.keys(key, programs.lanes)[lanes.seed]
+    state = programs.init(keys, groups, data, n_demos)
     book = Book(seeds_count, budget)
 
-    def evaluate(actor: Any, starts: int) -> Evaluation:
-        return judging.summarise(programs.judge.on_starts(actor, starts))
+    def of_seeds(tree: Any) -> Any:
+        """What lies in lanes, `[lanes, ...]`, as numpy `[seeds, ...]`."""
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes.of_seed], tree)
 
-    found = evaluate(actor, budget.evaluation_starts)
-    # A copy: `run` donates the state, and with it the actor.
-    best, best_return = jax.tree.map(jnp.copy, actor), jnp.asarray(found.return_mean)
+    def evaluate(starts: int) -> Evaluation:
+        found = programs.judge.on_starts(state.agent.actor, starts, groups)
+        return of_seeds(judging.summarise(found))
+
+    found = evaluate(budget.evaluation_starts)
+    best, best_return = _take(state.agent.actor, lanes.of_seed), jnp.asarray(found.return_mean)
     book.evaluated("steps", np.arange(seeds_count), found)
     report(Progress(0, book.solved_fraction(threshold)))
 
     limit = None if budget.max_episodes is None else jnp.int32(budget.max_episodes)
     for start, stop in _chunks(budget.max_steps, budget.evaluate_every):
+        active = book.running | (book.pending & ~book.diverged)
+        move = lanes.pack(active)
+        if move is not None:
+            state = programs.permute(state, move)
+        groups = lanes.groups(active)
         steps = jnp.arange(start, stop, dtype=jnp.int32)
-        state, log = programs.run(state, data, steps, limit)
+        state, log = programs.run(state, groups, data, steps, limit)
         was_running = book.running.copy()
-        book.mark_diverged(np.asarray(_finite(state))[:seeds_count])
-        book.stepped(steps=np.asarray(steps), log=jax.tree.map(np.asarray, log))
+        book.mark_diverged(of_seeds(_finite(state)))
+        book.stepped(steps=np.asarray(steps), log=of_seeds(log))
         due = np.flatnonzero(book.due_by_episodes() & ~book.diverged)
         if due.size:
-            found = evaluate(state.agent.actor, budget.evaluation_starts_episodes)
-            book.evaluated("episodes", due, found)
+            book.evaluated("episodes", due, evaluate(budget.evaluation_starts_episodes))
         book.pending |= was_running
         over = stop == budget.max_steps or not book.running.any()
         if stop % budget.evaluate_every == 0 or over:
-            found = evaluate(state.agent.actor, budget.evaluation_starts)
+            found = evaluate(budget.evaluation_starts)
             due = np.flatnonzero(book.pending & ~book.diverged)
             book.evaluated("steps", due, found)
             book.pending[:] = False
-            allowed = np.zeros(programs.padded, bool)
-            allowed[due] = True
-            returns = jnp.where(allowed, found.return_mean, -jnp.inf)
-            best, best_return = _keep_best(best, best_return, state.agent.actor, returns)
+            returns = np.full(seeds_count, -np.inf, found.return_mean.dtype)
+            returns[due] = found.return_mean[due]
+            actor = _take(state.agent.actor, lanes.of_seed)
+            best, best_return = _keep_best(best, best_return, actor, returns)
         report(Progress(stop, book.solved_fraction(threshold)))
         if over:
             break
 
-    def first_seeds(tree: Any) -> Any:
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[:seeds_count], tree)
-
     return CellResult(
         evaluations=book.evaluations,
         episodes=book.episode_rows(),
-        best=first_seeds(best),
-        reward=None if state.reward is None else first_seeds(state.reward.params),
+        best=jax.tree.map(np.asarray, best),
+        reward=None if state.reward is None else of_seeds(state.reward.params),
         env_steps=book.env_step,
         demonstration_steps=np.zeros(seeds_count, np.int32)
         if state.subset is None
-        else first_seeds(state.subset.length).sum(axis=1),
+        else of_seeds(state.subset.length).sum(axis=1),
         diverged=book.diverged,
-        final=first_seeds(state.agent.actor),
+        final=of_seeds(state.agent.actor),
     )
 
 
@@ -171,6 +195,11 @@ def _chunks(max_steps: int, evaluate_every: int) -> Iterator[tuple[int, int]]:
         stop = min(start + CHUNK, next_evaluation, max_steps)
         yield start, stop
         start = stop
+
+
+@jax.jit
+def _take(tree: Any, index: np.ndarray) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 @jax.jit

@@ -7,14 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import demonstrations, seeds
+from cmedirl_jax import demonstrations
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
-from cmedirl_jax.methods import METHODS, Settings
 from cmedirl_jax.types import Transition
-from experiments import cells, judging
+from experiments import cells
 from experiments.bookkeeping import Budget
-from experiments.cells import Progress
+from experiments.cells import Programs, Progress
 from experiments.errors import UserError
 from experiments.presets import Expert, ExpertSettings
 
@@ -27,7 +26,7 @@ def make_pool(
     env: Env,
     options: ExpertSettings,
     which: Expert,
-    devices: list[jax.Device],
+    programs: Programs,
     report: Callable[[Progress], None],
 ) -> Demonstrations:
     """Train experts and record noise-free trajectories, from fresh random starts.
@@ -37,27 +36,13 @@ def make_pool(
         env: the environment.
         options: how many experts, how long, how many trajectories.
         which: who demonstrates, see `choose`.
-        devices: to train on.
+        programs: DDPG's, with the settings that experts train with.
         report: called after each chunk of training.
 
     Raises:
         UserError: if no expert's final policy reaches the environment's threshold.
     """
     train_key, start_key = jax.random.split(key)
-    settings = Settings()
-    group = seeds.group_size(options.seeds, len(devices), settings.architecture.hidden)
-    judge = judging.make(env, settings.architecture, group, devices)
-    programs = cells.compile_method(
-        env,
-        METHODS["ddpg"],
-        settings,
-        judge,
-        group=group,
-        seeds_count=options.seeds,
-        devices=devices,
-        capacity=options.steps,
-        subset_size=None,
-    )
     threshold = env.spec.reward_threshold
     result = cells.train(
         programs,
@@ -81,9 +66,13 @@ def make_pool(
         )
     actors = jax.tree.map(lambda leaf: jnp.asarray(leaf[chosen]), result.final)
     per_expert = -(-options.trajectories // chosen.size)
-    recorded = jax.jit(jax.vmap(lambda actor, key: record(judge.act, env, actor, key, per_expert)))(
-        actors, jax.random.split(start_key, chosen.size)
-    )
+
+    @jax.jit
+    @jax.vmap
+    def record_all(actor: Any, key: jax.Array) -> tuple[Transition, jax.Array, jax.Array]:
+        return record(programs.judge.act, env, actor, key, per_expert)
+
+    recorded = record_all(actors, jax.random.split(start_key, chosen.size))
     transition, running, truncated = jax.tree.map(np.asarray, recorded)
     metadata = {
         "env": env.spec.id,

@@ -12,7 +12,8 @@ from rich.console import Console
 from cmedirl_jax import checkpoint, demonstrations, envs, hot_start, seeds
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
-from cmedirl_jax.methods import Method
+from cmedirl_jax.methods import METHODS, Method, Settings
+from cmedirl_jax.networks import Architecture
 from experiments import (
     cells,
     experts,
@@ -27,6 +28,7 @@ from experiments import (
 from experiments.bookkeeping import Budget
 from experiments.cells import Programs
 from experiments.errors import UserError
+from experiments.judging import Judge
 from experiments.planning import Cell
 from experiments.presets import Grid
 from experiments.progress import Reporter, reporter
@@ -81,11 +83,15 @@ def _train_cells(
     trains_experts = needs_pool and pool is None
     expert_steps = grid.experts.seeds * grid.experts.steps
     total = len(todo) * grid.seeds * budget.max_steps + expert_steps * trains_experts
+    compile_method = _compiler(grid, env, devices, budget)
     with reporter(console, len(todo) + trains_experts, total) as report:
         if trains_experts:
             report.start(f"experts, {grid.experts.seeds} seeds")
             advance = _stepwise(report, grid.experts.seeds)
-            pool = experts.make_pool(keys.experts, env, grid.experts, grid.expert, devices, advance)
+            programs = compile_method(METHODS["ddpg"], Settings())
+            pool = experts.make_pool(
+                keys.experts, env, grid.experts, grid.expert, programs, advance
+            )
         data, metadata = None, {}
         if pool is not None:
             planning.check_enough(grid, int(pool.episode[-1]) + 1)
@@ -97,10 +103,9 @@ def _train_cells(
         if pool is not None and not pool_path.exists():
             pool_path.parent.mkdir(exist_ok=True)
             demonstrations.save(pool_path, pool)
-        compile_method = _compiler(grid, env, devices, budget)
         for cell in todo:
             report.start(f"{cell.name}, {grid.seeds} seeds")
-            programs = compile_method(cell.method)
+            programs = compile_method(cell.method, grid.settings)
             result = cells.train(
                 programs,
                 keys.learners,
@@ -131,23 +136,31 @@ def _train_cells(
 
 def _compiler(
     grid: Grid, env: Env, devices: list[jax.Device], budget: Budget
-) -> Callable[[Method], Programs]:
-    """A function that makes each method's programs once, for all numbers of demonstrations."""
-    architecture = grid.settings.architecture
-    group = seeds.group_size(grid.seeds, len(devices), architecture.hidden)
-    judge = judging.make(env, architecture, group, devices)
+) -> Callable[[Method, Settings], Programs]:
+    """A function that makes each method's programs once: for all cells, and for the experts too."""
+    seeds_count, capacity = grid.seeds, budget.max_steps
+    if grid.demos is None:
+        seeds_count = max(seeds_count, grid.experts.seeds)
+        capacity = max(capacity, grid.experts.steps)
+
+    def group(architecture: Architecture) -> int:
+        return grid.group or seeds.group_size(grid.seeds, len(devices), architecture.hidden)
 
     @functools.cache
-    def compile_method(method: Method) -> Programs:
+    def judge(architecture: Architecture) -> Judge:
+        return judging.make(env, architecture, group(architecture), devices)
+
+    @functools.cache
+    def compile_method(method: Method, settings: Settings) -> Programs:
         return cells.compile_method(
             env,
             method,
-            grid.settings,
-            judge,
-            group=group,
-            seeds_count=grid.seeds,
+            settings,
+            judge(settings.architecture),
+            group=group(settings.architecture),
+            seeds_count=seeds_count,
             devices=devices,
-            capacity=budget.max_steps,
+            capacity=capacity,
             subset_size=max(grid.n_demos),
         )
 

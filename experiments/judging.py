@@ -18,13 +18,14 @@ class Judge(NamedTuple):
     """Compiled functions of actor parameters `[seeds, ...]`, any number of seeds.
 
     Attributes:
-        on_starts: `(actors, count) -> Rollouts` `[seeds, count]`, from the fixed start states.
+        on_starts: `(actors, count, groups=None) -> Rollouts` `[seeds, count]`, from the fixed start
+            states. With `groups` only so many groups of seeds on each device; the others get zeros.
         on_fresh_starts: `(actors, key, count) -> Rollouts` `[seeds, count]`, from random ones, the
             same for every seed.
         act: `(actor, observation [..., O]) -> action [..., A]` for one seed, not compiled.
     """
 
-    on_starts: Callable[[Any, int], Rollouts]
+    on_starts: Callable[..., Rollouts]
     on_fresh_starts: Callable[[Any, jax.Array, int], Rollouts]
     act: Callable[[Any, jax.Array], jax.Array]
 
@@ -37,30 +38,35 @@ def make(env: Env, architecture: Architecture, group: int, devices: list[jax.Dev
     def act(actor: Any, observation: jax.Array) -> jax.Array:
         return networks.policy(actor_critic, actor, observation)
 
-    def on_starts(actors: Any, count: int) -> Rollouts:
-        return spread(actors, env.starts(count, params))
+    def on_starts(actors: Any, count: int, groups: int | None = None) -> Rollouts:
+        return spread(actors, env.starts(count, params), groups)
 
     def on_fresh_starts(actors: Any, key: jax.Array, count: int) -> Rollouts:
         reset = jax.vmap(env.reset, in_axes=(0, None))
         return spread(actors, reset(jax.random.split(key, count), params))
 
-    def one(actor: Any, starts: Any) -> Rollouts:
-        return evaluation.rollout(functools.partial(act, actor), env, params, starts)
+    def one(actor: Any, starts: Any) -> tuple[Any, Rollouts]:
+        return actor, evaluation.rollout(functools.partial(act, actor), env, params, starts)
 
-    def spread(actors: Any, starts: Any) -> Rollouts:
+    @jax.jit
+    def spread(actors: Any, starts: Any, groups: int | None = None) -> Rollouts:
         count = jax.tree.leaves(actors)[0].shape[0]
-        extra = seeds.padded(count, group, len(devices)) - count
-        filled = jax.tree.map(lambda x: jnp.concatenate([x, x[:1].repeat(extra, 0)]), actors)
-        found = seeds.map_devices(seeds.map_groups(one, group), devices)(filled, starts)
+        lanes = seeds.padded(count, group, len(devices))
+        filled = jax.tree.map(
+            lambda x: jnp.concatenate([x, x[:1].repeat(lanes - count, 0)]), actors
+        )
+        if groups is None:
+            groups = lanes // (group * len(devices))
+        mapped = seeds.map_devices(seeds.step_groups(one, group), devices)
+        _, found = mapped(filled, groups, starts)
         return jax.tree.map(lambda x: x[:count], found)
 
-    return Judge(
-        on_starts=jax.jit(on_starts, static_argnums=1),
-        on_fresh_starts=jax.jit(on_fresh_starts, static_argnums=2),
-        act=act,
-    )
+    return Judge(on_starts, on_fresh_starts, act)
 
 
 def summarise(rollouts: Rollouts) -> Evaluation:
     """Each seed's statistics over its starts, `[seeds]`, on the host."""
-    return jax.tree.map(np.asarray, jax.vmap(evaluation.summarise)(rollouts))
+    return jax.tree.map(np.asarray, _summarise(rollouts))
+
+
+_summarise = jax.jit(jax.vmap(evaluation.summarise))

@@ -94,6 +94,7 @@ def _positive(grid: Grid) -> list[tuple[str, float | None]]:
             "evaluate_every_episodes",
             "evaluation_starts_episodes",
             "devices",
+            "group",
         )
     ]
     groups: list[tuple[str, Any, tuple[str, ...]]] = [

@@ -63,6 +63,8 @@ class Grid:
     """The environment, by Gymnasium's name."""
     devices: int | None = None
     """CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU."""
+    group: int | None = None
+    """Seeds that a device steps together; default: what is fastest for the networks' width."""
     experts: ExpertSettings = ExpertSettings()
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
 

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import dataclasses
 import os
 import sys
 from collections.abc import Sequence
@@ -14,8 +15,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from experiments import compilation, planning
 from experiments import grid as grid_lib
-from experiments import planning
 from experiments.errors import UserError
 from experiments.presets import PRESETS, Grid
 
@@ -26,6 +27,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console()
     if not console.is_terminal:
         console = Console(width=120)
+    cost = compilation.cost()
+    before = dataclasses.replace(cost)
+    compilation.use_cache()
     try:
         # Before anything else: the first array that JAX makes fixes the number of CPU devices.
         devices = start_devices(grid)
@@ -39,6 +43,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
     if summary["diverged"].sum():
         console.print(f"Seeds that diverged and were stopped: {summary['diverged'].sum()}")
+    console.print(
+        f"Compilation: {cost.seconds - before.seconds:.1f} s; {cost.hits - before.hits} programs "
+        f"from the cache, {cost.misses - before.misses} new",
+        highlight=False,
+    )
     console.print(f"Tables and figures: {grid.folder}", highlight=False, soft_wrap=True)
     return 0
 

@@ -31,6 +31,7 @@ class Chunk(NamedTuple):
     steps: np.ndarray
     log: Log
     actor: Any
+    groups: int
 
 
 class Trained(NamedTuple):
@@ -69,12 +70,19 @@ def programs(env):
 
 
 def train(programs, budget, *, threshold=0.0, before_chunk=lambda state, first_step: state):
-    chunks, reports = [], []
+    chunks, reports, seed_keys = [], [], []
 
-    def run(state, data, steps, limit):
-        state, log = programs.run(before_chunk(state, int(steps[0])), data, steps, limit)
+    def run(state, groups, data, steps, limit):
+        keys = [key.tobytes() for key in np.asarray(jax.random.key_data(state.key))]
+        if not seed_keys:
+            seed_keys.extend(keys)
+        # Seeds change their lanes, never their keys.
+        lanes = [keys.index(key) for key in seed_keys]
+        state = before_chunk(state, int(steps[0]))
+        state, log = programs.run(state, groups, data, steps, limit)
         # Copies: the next call is given the state to overwrite.
-        chunks.append(jax.tree.map(np.array, Chunk(steps, log, state.agent.actor)))
+        of_seeds = jax.tree.map(lambda leaf: np.array(leaf)[lanes], (log, state.agent.actor))
+        chunks.append(Chunk(np.array(steps), *of_seeds, groups))
         return state, log
 
     with pytest.MonkeyPatch.context() as patch:
@@ -280,6 +288,20 @@ def test_a_seed_that_has_ended_learns_no_more(by_episodes):
     assert len(after_the_end) > SEEDS
     for seed, chunk in after_the_end:
         assert_same(actor_of(chunk.actor, seed), actor_of(result.final, seed))
+
+
+def test_groups_without_a_running_seed_are_not_stepped(programs, by_steps, by_episodes):
+    assert {chunk.groups for chunk in by_steps.chunks} == {2}
+    # Every chunk ends with an evaluation, so no seed is kept for one after its end.
+    trained = train(programs, dataclasses.replace(BY_EPISODES, evaluate_every=CHUNK))
+    np.testing.assert_array_equal(trained.result.env_steps, by_episodes.result.env_steps)
+    running = [
+        sum(chunk.steps[0] < end for end in trained.result.env_steps) for chunk in trained.chunks
+    ]
+    assert min(running) < SEEDS
+    assert [chunk.groups for chunk in trained.chunks] == [-(-count // 2) for count in running]
+    assert episode_rows(trained.result) == episode_rows(by_episodes.result)
+    assert_same(trained.result.final, by_episodes.result.final)
 
 
 def test_an_ended_seeds_last_evaluation_is_of_its_final_policy(by_episodes, programs):

@@ -145,15 +145,13 @@ def make_pool(env, monkeypatch):
                 final=STRENGTHS,
             )
 
-        monkeypatch.setattr(experts.judging, "make", lambda *_: types.SimpleNamespace(act=act))
-        monkeypatch.setattr(experts.cells, "compile_method", lambda *_, **__: None)
         monkeypatch.setattr(experts.cells, "train", train)
         return experts.make_pool(
             jax.random.key(0),
             env,
             ExpertSettings(seeds=STRENGTHS.size, steps=500, trajectories=trajectories),
             "all",
-            jax.devices()[:1],
+            types.SimpleNamespace(judge=types.SimpleNamespace(act=act)),
             lambda progress: None,
         )
 

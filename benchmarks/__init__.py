@@ -1,0 +1,1 @@
+"""How fast cmedirl_jax is, and beside whom."""

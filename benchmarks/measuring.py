@@ -1,0 +1,169 @@
+"""Workloads timed in turn, each in a process of its own, and what is written about them."""
+
+import dataclasses
+import importlib.metadata
+import itertools
+import json
+import os
+import platform
+import statistics
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.serving import Worker
+from benchmarks.workload import CAPACITY, Workload
+
+PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """What was measured of one workload.
+
+    Attributes:
+        workload: what ran.
+        rates: learning steps per second, all seeds together, of each round.
+        compile_seconds: spent on tracing and compiling until the end of the first call.
+        peak_memory_bytes: of the process; None where the system does not account for it.
+        platform: "cpu" or "gpu".
+    """
+
+    workload: Workload
+    rates: list[float]
+    compile_seconds: float
+    peak_memory_bytes: int | None
+    platform: str
+
+    def fields(self) -> dict[str, Any]:
+        """As the JSON has it; seeds per second are those of a main job of `CAPACITY` steps."""
+        median = statistics.median(self.rates)
+        workload = dataclasses.asdict(self.workload)
+        width = workload.pop("hidden")
+        return {
+            **workload,
+            "width": width,
+            "learning_steps_per_second": median,
+            "learning_steps_per_second_best": max(self.rates),
+            "learning_steps_per_second_worst": min(self.rates),
+            "seeds_per_second": median / CAPACITY,
+            "compile_seconds": self.compile_seconds,
+            "peak_memory_bytes": self.peak_memory_bytes,
+            "platform": self.platform,
+            "rounds": len(self.rates),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """The ratio of two workloads' rates, round by round: what holds on a noisy machine."""
+
+    suite: str
+    name: str
+    median: float
+    low: float
+    high: float
+
+
+def compare(suite: str, name: str, above: Sequence[float], below: Sequence[float]) -> Comparison:
+    """The ratio of two workloads' rates that were measured in turn."""
+    ratios = [x / y for x, y in zip(above, below, strict=True)]
+    return Comparison(suite, name, statistics.median(ratios), min(ratios), max(ratios))
+
+
+def in_turn(workers: Sequence[tuple[Worker, int, float]], rounds: int) -> list[list[float]]:
+    """Rates of each worker, `rounds` of them, measured A B C A B C ...
+
+    Args:
+        workers: each with the steps to ask of it and the learning steps that those are.
+        rounds: how often each is asked.
+    """
+    rates: list[list[float]] = [[] for _ in workers]
+    for _ in range(rounds):
+        for (worker, steps, learning_steps), measured in zip(workers, rates, strict=True):
+            measured.append(learning_steps / worker.seconds(steps))
+    return rates
+
+
+def measure(
+    workloads: Sequence[Workload], rounds: int, *, compile_together: bool = False
+) -> list[Record]:
+    """Time workloads in turn, those of one device on one core.
+
+    Args:
+        workloads: what to time.
+        rounds: how often.
+        compile_together: let them all compile at once, which is sooner done but says nothing about
+            what one of them takes to compile.
+    """
+    workers: list[Worker] = []
+    try:
+        for workload in workloads:
+            workers += [start(workload, steps_per_call(workload))]
+            if not compile_together:
+                workers[-1].facts  # noqa: B018
+        asked = []
+        for worker, workload in zip(workers, workloads, strict=True):
+            assert worker.facts
+            steps = steps_per_call(workload)
+            asked.append((worker, steps, workload.seeds * workload.running * steps))
+        rates = in_turn(asked, rounds)
+        return [
+            Record(
+                workload,
+                measured,
+                worker.facts["compile_seconds"],
+                worker.peak_memory_bytes,
+                worker.facts["platform"],
+            )
+            for workload, worker, measured in zip(workloads, workers, rates, strict=True)
+        ]
+    finally:
+        for worker in workers:
+            worker.stop()
+
+
+def start(workload: Workload, steps: int, **environment: str) -> Worker:
+    """The process of a workload, its first call of `steps` steps done."""
+    options = json.dumps({**dataclasses.asdict(workload), "steps": steps})
+    command = [sys.executable, "-m", "benchmarks.worker", options]
+    return Worker(command, one_core() if workload.devices == 1 else None, **environment)
+
+
+def steps_per_call(workload: Workload) -> int:
+    """Steps that take some seconds: as many as a chunk of a run, more for few or small learners."""
+    more = min(4, max(1, round(10_000 / (250 * workload.seeds))))
+    less = max(1, (workload.hidden[0] // 64) * workload.batch // 32, workload.seeds // 400)
+    return max(50, 250 * more // less)
+
+
+def one_core() -> list[int] | None:
+    """The last of the cores that this process may use; None where that cannot be said."""
+    return sorted(os.sched_getaffinity(0))[-1:] if hasattr(os, "sched_getaffinity") else None
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def machine() -> dict[str, Any]:
+    """What the numbers were measured on."""
+    model = platform.processor()
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        lines = information.read_text().splitlines()
+        names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+        model = next(itertools.chain(names, [model]))
+    return {
+        "processor": model,
+        "cores": cores(),
+        "system": platform.system(),
+        "python": platform.python_version(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that the numbers depend on."""
+    return {name: importlib.metadata.version(name) for name in PACKAGES}

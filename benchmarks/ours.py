@@ -1,0 +1,65 @@
+"""The library's training loop, as `experiments.run_grid` runs it."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.workload import CAPACITY, Workload
+from cmedirl_jax import envs, hot_start, seeds
+from cmedirl_jax.demonstrations import Demonstrations
+from cmedirl_jax.methods import METHODS, Settings
+from cmedirl_jax.networks import Architecture
+from cmedirl_jax.schedules import RewardSchedule, Schedule
+from experiments import cells, judging
+from experiments.lanes import Lanes
+
+
+def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
+    """A function that takes so many steps with every seed, compiled by its first call."""
+    env = envs.make("MountainCarContinuous-v0")
+    settings = Settings(
+        architecture=Architecture(
+            hidden=workload.hidden,
+            critic_normalisation="layer" if workload.layer_norm else "none",
+        ),
+        # Never frozen, so that its cost is the same however long the benchmark runs.
+        reward_schedule=RewardSchedule(
+            stop=None, batch_size=workload.batch, hidden=workload.hidden
+        ),
+        schedule=Schedule(batch_size=workload.batch),
+    )
+    devices = jax.devices()[: workload.devices]
+    group = workload.group or seeds.group_size(workload.seeds, len(devices), workload.hidden)
+    programs = cells.compile_method(
+        env,
+        METHODS[workload.method],
+        settings,
+        judging.make(env, settings.architecture, group, devices),
+        group=group,
+        seeds_count=workload.seeds,
+        devices=devices,
+        capacity=CAPACITY,
+        subset_size=workload.n_demos,
+    )
+    data = hot_start.data(pool) if METHODS[workload.method].uses_demonstrations else None
+    lanes = Lanes(programs.lanes, workload.seeds, group, len(devices))
+    active = np.arange(workload.seeds) < round(workload.running * workload.seeds)
+    keys = seeds.keys(jax.random.key(0), programs.lanes)[lanes.seed]
+    everyone = lanes.groups(np.ones(workload.seeds, bool))
+    state = programs.init(keys, everyone, data, workload.n_demos)
+    move = lanes.pack(np.random.default_rng(0).permutation(active))
+    if move is not None:
+        state = programs.permute(state, move)
+    groups = -(-int(active.sum()) // (group * len(devices)))
+    taken = 0
+
+    def advance(steps: int) -> None:
+        nonlocal state, taken
+        numbers = jnp.arange(taken, taken + steps, dtype=jnp.int32)
+        state, log = programs.run(state, groups, data, numbers, None)
+        jax.block_until_ready((state, log))
+        taken += steps
+
+    return advance

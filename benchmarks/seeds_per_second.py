@@ -1,0 +1,197 @@
+"""`python -m benchmarks.seeds_per_second`: how many seeds a second, against a plain reference.
+
+Every number comes from workloads that are timed in turn, so that the ratios hold on a machine whose
+speed drifts. A workload of one device runs on one core.
+"""
+
+import dataclasses
+import datetime
+import itertools
+import json
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import tyro
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks import measuring, plots
+from benchmarks.measuring import Comparison, Record
+from benchmarks.workload import Workload
+from cmedirl_jax.methods import METHODS
+
+METHOD_NAMES = ("ddpg", "hs-ddpg", "me-ddpg", "hs-me-ddpg")
+SEEDS = (1, 8, 32, 100, 1000)
+WIDTHS = ((64, 64), (128, 128), (400, 300))
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to measure, and where to write it."""
+
+    quick: bool = False
+    """DDPG at 100 seeds alone, on one device and on all: within a minute."""
+    suites: tuple[str, ...] = ()
+    """Only these parts of the whole; see the names in the JSON."""
+    devices: int | None = None
+    """Devices of the workloads that use several; default: every core, or every GPU."""
+    rounds: int | None = None
+    """How often each workload is timed; default 5, with --quick 3."""
+    json: Path | None = None
+    """File for the measurements; a plot is drawn beside it."""
+
+
+class Suite(NamedTuple):
+    """Workloads that are timed in turn; `ratios` names pairs of them by position."""
+
+    name: str
+    workloads: list[Workload]
+    ratios: list[tuple[str, int, int]]
+
+
+def suites(devices: int, quick: bool) -> Iterator[Suite]:
+    """All there is to measure, in parts."""
+    ours, naive = Workload(), Workload("naive")
+    everywhere = dataclasses.replace(ours, devices=devices)
+    if quick:
+        workloads = [ours, naive] + [everywhere] * (devices > 1)
+        ratios = [("ours / naive", 0, 1), (f"{devices} devices / 1", 2, 0)]
+        yield Suite("quick", workloads, ratios[: len(workloads) - 1])
+        return
+    for method, seeds in itertools.product(METHOD_NAMES, SEEDS):
+        pair = [Workload(variant, method, seeds) for variant in ("ours", "naive")]
+        yield Suite("seeds", pair, [(f"ours / naive, {method}, {seeds} seeds", 0, 1)])
+    for hidden, layer_norm in itertools.product(WIDTHS, (False, True)):
+        pair = [
+            Workload(variant, hidden=hidden, layer_norm=layer_norm) for variant in ("ours", "naive")
+        ]
+        name = f"ours / naive, width {hidden}{', layer norm' * layer_norm}"
+        yield Suite("width", pair, [(name, 0, 1)])
+    pair = [Workload(variant, batch=128) for variant in ("ours", "naive")]
+    yield Suite("batch", pair, [("ours / naive, batch 128", 0, 1)])
+    yield Suite(
+        "method",
+        [Workload(method=method) for method in METHOD_NAMES] + [Workload(layer_norm=True)],
+        [
+            *((f"cost of {name} / ddpg", 0, i) for i, name in enumerate(METHOD_NAMES[1:], start=1)),
+            ("cost of layer norm / none", 0, 4),
+        ],
+    )
+    yield Suite("scale", [ours, Workload(seeds=1000)], [("1,000 seeds / 100 seeds", 1, 0)])
+    if devices > 1:
+        for method in METHOD_NAMES:
+            one = Workload(method=method)
+            pair = [dataclasses.replace(one, devices=devices), one]
+            yield Suite("devices", pair, [(f"{devices} devices / 1, {method}", 0, 1)])
+    yield Suite(
+        "ended",
+        [Workload(running=0.2), ours],
+        [("rate with 20% of the seeds running / all", 0, 1)],
+    )
+    demonstrated = [Workload(method="me-ddpg", n_demos=count) for count in (1, 10, 100, 1000)]
+    names = [f"cost with {workload.n_demos} demonstrations / 1" for workload in demonstrated]
+    yield Suite("demonstrations", demonstrated, [(names[i], 0, i) for i in range(1, 4)])
+    for hidden in WIDTHS:
+        sizes = (1, 2, 4, 5, 10, 20, 50, 100) if hidden[0] == 64 else (1, 2, 5, 10)
+        groups = [Workload(hidden=hidden, group=size) for size in sizes]
+        ratios = [(f"width {hidden}, groups of {size} / 1", i, 0) for i, size in enumerate(sizes)]
+        yield Suite("group", groups, ratios[1:])
+
+
+def compilation_times() -> list[dict[str, Any]]:
+    """What compiling each method costs with an empty cache, and with one that holds it."""
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        for method, cache in itertools.product(METHOD_NAMES, ("cold", "warm")):
+            workload = Workload(method=method, devices=measuring.cores())
+            worker = measuring.start(workload, 250, JAX_COMPILATION_CACHE_DIR=folder)
+            seconds = worker.facts["compile_seconds"]
+            worker.stop()
+            found.append({"method": method, "cache": cache, "compile_seconds": seconds})
+    return found
+
+
+def main(options: Options) -> int:
+    """Measure, print and write."""
+    assert set(METHOD_NAMES) <= set(METHODS)
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    records: list[tuple[str, Record]] = []
+    comparisons: list[Comparison] = []
+    devices = options.devices or measuring.cores()
+    rounds = options.rounds or (3 if options.quick else 5)
+    for suite in suites(devices, options.quick):
+        if options.suites and suite.name not in options.suites:
+            continue
+        found = measuring.measure(suite.workloads, rounds, compile_together=options.quick)
+        records += [(suite.name, record) for record in found]
+        comparisons += [
+            measuring.compare(suite.name, name, found[above].rates, found[below].rates)
+            for name, above, below in suite.ratios
+        ]
+        for comparison in comparisons[-len(suite.ratios) :]:
+            console.print(_line(comparison), highlight=False)
+    whole = not options.quick and (not options.suites or "compilation" in options.suites)
+    result = {
+        "command": "python -m benchmarks.seeds_per_second " + " ".join(sys.argv[1:]),
+        "date": datetime.date.today().isoformat(),
+        "machine": measuring.machine(),
+        "versions": measuring.versions(),
+        "records": [{"suite": suite, **record.fields()} for suite, record in records],
+        "comparisons": [dataclasses.asdict(comparison) for comparison in comparisons],
+        "compilation": compilation_times() if whole else [],
+    }
+    console.print(table(result["records"]))
+    if options.json is not None:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps(result, indent=1) + "\n")
+        plots.growth(result["records"], options.json.with_suffix(".png"))
+    return 0
+
+
+def table(records: list[dict[str, Any]]) -> Table:
+    """The measurements, a row for each workload."""
+    shown = Table(box=box.SIMPLE, title="medians; seeds of 12,000 steps")
+    for name in (
+        "method",
+        "variant",
+        "seeds",
+        "devices",
+        "width",
+        "batch",
+        "steps/s",
+        "seeds/s",
+        "compile s",
+        "peak MB",
+    ):
+        shown.add_column(name, justify="left" if name in ("method", "variant") else "right")
+    for record in records:
+        width = "x".join(map(str, record["width"])) + " LN" * record["layer_norm"]
+        memory = record["peak_memory_bytes"]
+        shown.add_row(
+            record["method"],
+            record["variant"],
+            f"{record['seeds']:,}",
+            str(record["devices"]),
+            width,
+            str(record["batch"]),
+            f"{record['learning_steps_per_second']:,.0f}",
+            f"{record['seeds_per_second']:.3g}",
+            f"{record['compile_seconds']:.1f}",
+            "?" if memory is None else f"{memory / 1e6:,.0f}",
+        )
+    return shown
+
+
+def _line(comparison: Comparison) -> str:
+    return (
+        f"{comparison.name}: {comparison.median:.2f} "
+        f"({comparison.low:.2f} to {comparison.high:.2f} over the rounds)"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, prog="python -m benchmarks.seeds_per_second")))

@@ -1,0 +1,104 @@
+"""The two ends of a timed loop in a process of its own: `serve` in it, `Worker` outside.
+
+Each loop lives in a separate process, so that it has its own devices, cores, compiler and peak of
+memory, and so that loops can be timed in turn, which cancels the drift of a shared machine. Only
+the standard library is used here: peers import this from environments without this project's.
+"""
+
+import contextlib
+import functools
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+try:
+    import resource
+except ImportError:  # Windows has no such accounting; the memory is then not reported.
+    resource = None
+
+
+def serve(advance: Callable[[int], Any], steps: int, facts: Callable[[], dict] = dict) -> None:
+    """Time `advance(steps)` whenever asked to, until standard input ends.
+
+    Args:
+        advance: takes so many steps with every learner, and returns when they are done.
+        steps: of the first call, which compiles and is not counted.
+        facts: what else to report after that call.
+    """
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
+    with contextlib.redirect_stdout(sys.stderr):
+        began = time.perf_counter()
+        advance(steps)
+        first = time.perf_counter() - began
+        print(json.dumps({"first_call_seconds": first, **facts()}), file=answers)
+        for line in sys.stdin:
+            began = time.perf_counter()
+            advance(int(line))
+            seconds = time.perf_counter() - began
+            print(json.dumps({"seconds": seconds, "peak_memory_bytes": _peak()}), file=answers)
+
+
+class Worker:
+    """A process that serves a loop.
+
+    Attributes:
+        peak_memory_bytes: its resident memory's peak so far, or None where it is not accounted for.
+    """
+
+    def __init__(self, command: Sequence[str], cores: Sequence[int] | None, **environment: str):
+        """Start `command`, on `cores` alone where given and where the system can do that."""
+        pin = None
+        if cores is not None and hasattr(os, "sched_setaffinity"):
+            pin = lambda: os.sched_setaffinity(0, cores)  # noqa: E731
+        root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=pin,
+            env={**os.environ, "PYTHONPATH": root, **environment},
+        )
+        self.peak_memory_bytes: int | None = None
+
+    @functools.cached_property
+    def facts(self) -> dict[str, Any]:
+        """What it reported when its first call was done; waits for that.
+
+        Raises:
+            RuntimeError: with the end of its errors, if it never gets there.
+        """
+        return self._answer()
+
+    def seconds(self, steps: int) -> float:
+        """How long its learners take for so many steps each; once `facts` are there."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{steps}\n")
+        self._process.stdin.flush()
+        answer = self._answer()
+        self.peak_memory_bytes = answer["peak_memory_bytes"]
+        return answer["seconds"]
+
+    def stop(self) -> None:
+        """End the process."""
+        self._process.communicate()
+
+    def _answer(self) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            _, errors = self._process.communicate()
+            raise RuntimeError(f"{' '.join(map(str, self._process.args))}:\n{errors[-2000:]}")
+        return json.loads(line)
+
+
+def _peak() -> int | None:
+    if resource is None:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak

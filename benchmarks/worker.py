@@ -1,0 +1,46 @@
+"""The process that runs one workload: `python -m benchmarks.worker '{"method": "ddpg", ...}'`."""
+
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks import naive, ours
+from benchmarks.serving import serve
+from benchmarks.workload import Workload
+from cmedirl_jax import envs
+from cmedirl_jax.demonstrations import Demonstrations
+from experiments import compilation, experts
+
+
+def demonstrations(episodes: int) -> Demonstrations:
+    """Episodes of a scripted controller, which solves the task in about as many steps as DDPG."""
+    env = envs.make("MountainCarContinuous-v0")
+
+    def act(actor: None, observation: jax.Array) -> jax.Array:
+        return 0.8 * jnp.sign(observation[..., 1:])
+
+    record = jax.jit(lambda key: experts.record(act, env, None, key, episodes))
+    transition, running, truncated = jax.device_get(record(jax.random.key(1)))
+    return experts.flatten(transition, running, truncated, {"env": env.spec.id})
+
+
+def main() -> None:
+    """Serve the workload that the command line describes."""
+    options = json.loads(sys.argv[1])
+    steps = options.pop("steps")
+    workload = Workload(**{**options, "hidden": tuple(options["hidden"])})
+    jax.config.update("jax_num_cpu_devices", workload.devices)
+    if jax.config.jax_compilation_cache_dir is not None:
+        compilation.use_cache()
+    cost = compilation.cost()
+    variant = {"ours": ours, "naive": naive}[workload.variant]
+    advance = variant.start(workload, demonstrations(workload.n_demos))
+    serve(
+        advance, steps, lambda: {"compile_seconds": cost.seconds, "platform": jax.default_backend()}
+    )
+
+
+if __name__ == "__main__":
+    main()

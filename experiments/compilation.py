@@ -1,0 +1,56 @@
+"""The compiler's cache on disk, and the count of what compiling cost."""
+
+import dataclasses
+import functools
+
+import jax
+import platformdirs
+
+_DURATIONS = (
+    "/jax/core/compile/jaxpr_trace_duration",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration",
+    "/jax/core/compile/backend_compile_duration",
+)
+_HIT, _MISS = "/jax/compilation_cache/cache_hits", "/jax/compilation_cache/cache_misses"
+
+
+@dataclasses.dataclass
+class Cost:
+    """What compiling has cost this process.
+
+    Attributes:
+        seconds: spent on tracing, lowering, compiling and reading the cache.
+        hits: programs that were found in the cache.
+        misses: programs that were not.
+    """
+
+    seconds: float = 0.0
+    hits: int = 0
+    misses: int = 0
+
+
+@functools.cache
+def cost() -> Cost:
+    """The cost since the first call, which begins the count; it goes on counting."""
+    total = Cost()
+
+    def spent(event: str, seconds: float, **_: str | int) -> None:
+        if event in _DURATIONS:
+            total.seconds += seconds
+
+    def happened(event: str, **_: str | int) -> None:
+        total.hits += event == _HIT
+        total.misses += event == _MISS
+
+    jax.monitoring.register_event_duration_secs_listener(spent)
+    jax.monitoring.register_event_listener(happened)
+    return total
+
+
+def use_cache() -> None:
+    """Keep compiled programs in the user's cache folder, unless JAX was told where to keep them."""
+    if jax.config.jax_compilation_cache_dir is None:
+        folder = platformdirs.user_cache_path("cmedirl_jax", appauthor=False) / "compiled"
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    # Small programs too: there are many, and each would be compiled at every start.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
