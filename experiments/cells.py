@@ -101,10 +101,12 @@ def compile_method(
     def permute(state: TrainingState, move: np.ndarray) -> TrainingState:
         return jax.tree.map(lambda leaf: leaf[move], state)
 
+    # One sharding everywhere: another one, even if equivalent, would compile again.
+    split = seeds.sharding(devices)
     return Programs(
-        init=jax.jit(init),
-        run=jax.jit(spread(trainer.run), donate_argnums=0),
-        permute=jax.jit(permute, donate_argnums=0, out_shardings=seeds.sharding(devices)),
+        init=jax.jit(init, out_shardings=split),
+        run=jax.jit(spread(trainer.run), donate_argnums=0, out_shardings=split),
+        permute=jax.jit(permute, donate_argnums=0, out_shardings=split),
         judge=judge,
         lanes=seeds.padded(seeds_count, group, len(devices)),
         group=group,

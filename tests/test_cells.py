@@ -302,6 +302,8 @@ def test_groups_without_a_running_seed_are_not_stepped(programs, by_steps, by_ep
     assert [chunk.groups for chunk in trained.chunks] == [-(-count // 2) for count in running]
     assert episode_rows(trained.result) == episode_rows(by_episodes.result)
     assert_same(trained.result.final, by_episodes.result.final)
+    # Neither fewer groups nor seeds in other lanes compile again.
+    assert programs.run._cache_size() <= 2, "with a limit of episodes and without"
 
 
 def test_an_ended_seeds_last_evaluation_is_of_its_final_policy(by_episodes, programs):

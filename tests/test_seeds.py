@@ -83,3 +83,53 @@ def test_mapping_over_devices_equals_vmap():
     mapped = jax.jit(seeds.map_devices(seeds.map_groups(walk, 3), devices))(states(count), *SHARED)
     assert_equals_vmap(mapped, count)
     assert mapped["position"].sharding.device_set == set(devices)
+
+
+def stroll(state, scale, offset):
+    state = walk(state, scale, offset)
+    return state, {"norm": jnp.linalg.norm(state["position"]), "key": state["key"]}
+
+
+@pytest.mark.parametrize(("group", "groups"), [(1, 5), (3, 0), (3, 2), (12, 1)])
+def test_stepping_some_groups_equals_vmap_on_them_and_leaves_the_others(group, groups):
+    stepped, outputs = jax.jit(seeds.step_groups(stroll, group))(states(12), groups, *SHARED)
+    expected, expected_outputs = jax.vmap(stroll, in_axes=(0, None, None))(states(12), *SHARED)
+    first = group * groups
+    for tree, inside, outside in (
+        (stepped, expected, states(12)),
+        (outputs, expected_outputs, jax.tree.map(jnp.zeros_like, expected_outputs)),
+    ):
+        for name, leaf in tree.items():
+            np.testing.assert_allclose(
+                *map(numbers, (leaf[:first], inside[name][:first])), rtol=1e-6
+            )
+            np.testing.assert_array_equal(*map(numbers, (leaf[first:], outside[name][first:])))
+
+
+def numbers(leaf):
+    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jax.random.key_data(leaf) if is_key else leaf
+
+
+def test_another_number_of_groups_does_not_compile_again():
+    stepped = jax.jit(seeds.step_groups(stroll, 3))
+    for groups in range(5):
+        stepped(states(12), groups, *SHARED)
+    assert stepped._cache_size() == 1
+
+
+def test_stepped_groups_must_be_whole():
+    with pytest.raises(ValueError, match="12 seeds are not whole groups of 5"):
+        seeds.step_groups(stroll, 5)(states(12), 1, *SHARED)
+
+
+def test_stepping_over_devices_steps_the_first_groups_of_each():
+    devices = jax.devices()
+    count = 6 * len(devices)
+    mapped = jax.jit(seeds.map_devices(seeds.step_groups(stroll, 3), devices))
+    stepped, outputs = mapped(states(count), 1, *SHARED)
+    expected = jax.vmap(walk, in_axes=(0, None, None))(states(count), *SHARED)
+    moved = np.arange(count) % 6 < 3
+    np.testing.assert_allclose(stepped["position"][moved], expected["position"][moved], rtol=1e-6)
+    np.testing.assert_array_equal(stepped["position"][~moved], 1.0)
+    assert outputs["norm"].sharding.is_equivalent_to(seeds.sharding(devices), 1)
