@@ -42,6 +42,11 @@ def serve(advance: Callable[[int], Any], steps: int, facts: Callable[[], dict] =
             print(json.dumps({"seconds": seconds, "peak_memory_bytes": _peak()}), file=answers)
 
 
+def serve_from_command_line(advance: Callable[[int], Any]) -> None:
+    """`serve`, with the steps of the first call as the command's last argument."""
+    serve(advance, int(sys.argv[-1]))
+
+
 class Worker:
     """A process that serves a loop.
 

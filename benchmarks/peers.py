@@ -1,0 +1,209 @@
+"""`python -m benchmarks.peers`: our rate beside that of other libraries, on one core.
+
+Each peer gets an environment of its own, made at its first use and kept in the user's cache folder.
+All loops use the same networks, batch and replay and take one update per environment step; they are
+timed in turn. What is not the same work is printed with the numbers.
+"""
+
+import dataclasses
+import datetime
+import json
+import os
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import platformdirs
+import tyro
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks import measuring
+from benchmarks.serving import Worker
+from benchmarks.workload import Workload
+
+STEPS = 500
+"""Environment steps per learner and round."""
+
+
+class Peer(NamedTuple):
+    """Another library's training loop.
+
+    Attributes:
+        name: as the table has it.
+        module: of `benchmarks.peer_loops`.
+        requirements: what pip installs into its environment.
+        seeds: learners that it trains at once.
+        difference: what is not the same work.
+    """
+
+    name: str
+    module: str
+    requirements: tuple[str, ...]
+    seeds: int
+    difference: str
+
+
+PEERS = (
+    Peer(
+        "stable-baselines3 DDPG",
+        "sb3_ddpg",
+        ("torch==2.13.0", "stable-baselines3"),
+        1,
+        "one seed; the environment is Gymnasium's, in Python",
+    ),
+    Peer(
+        "sbx DDPG",
+        "sbx_ddpg",
+        ("torch==2.13.0", "sbx-rl"),
+        1,
+        "one seed; the environment is Gymnasium's, in Python",
+    ),
+    Peer(
+        "CleanRL-style JAX loop",
+        "cleanrl_style",
+        ("jax", "flax", "optax", "gymnasium"),
+        1,
+        "one seed; the environment is Gymnasium's, in Python; Gaussian noise",
+    ),
+    Peer(
+        "rejax TD3",
+        "rejax_td3",
+        ("rejax", "gymnax==0.0.9"),
+        100,
+        "two critics and target noise; swish units; Gaussian noise; gymnax's physics",
+    ),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Whom to compare with, and where to write it."""
+
+    peers: tuple[str, ...] = tuple(peer.module for peer in PEERS)
+    """Which peers."""
+    rounds: int = 7
+    """How often each is timed."""
+    environments: Path = platformdirs.user_cache_path("cmedirl_jax", appauthor=False) / "peers"
+    """Folder of the peers' environments."""
+    json: Path | None = None
+    """File for the measurements."""
+
+
+def environment(peer: Peer, folder: Path) -> Path:
+    """The Python of the peer's environment, which is made if it is not there.
+
+    Raises:
+        RuntimeError: if something cannot be installed, with the end of what the installer said.
+    """
+    root = folder / peer.module
+    python = root / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    ready = root / "requirements.txt"
+    wanted = "\n".join(peer.requirements)
+    if ready.exists() and ready.read_text() == wanted:
+        return python
+    subprocess.run([sys.executable, "-m", "venv", "--clear", root], check=True)
+    installed = subprocess.run(
+        [python, "-m", "pip", "install", "--quiet", *peer.requirements],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if installed.returncode:
+        raise RuntimeError(installed.stderr.strip()[-500:])
+    ready.write_text(wanted)
+    return python
+
+
+def versions(python: Path) -> dict[str, str]:
+    """What is installed beside a peer."""
+    listed = subprocess.run(
+        [python, "-m", "pip", "list", "--format", "json"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return {package["name"]: package["version"] for package in json.loads(listed.stdout)}
+
+
+def main(options: Options) -> int:
+    """Install, measure, print and write."""
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    ours = Workload()
+    workers = [(measuring.start(ours, STEPS), STEPS, float(ours.seeds * STEPS))]
+    measured: list[Peer] = []
+    entries: list[dict[str, Any]] = []
+    try:
+        for peer in (peer for peer in PEERS if peer.module in options.peers):
+            console.print(f"{peer.name}: preparing")
+            entry: dict[str, Any] = peer._asdict()
+            entries.append(entry)
+            try:
+                python = environment(peer, options.environments)
+                command = [python, "-m", f"benchmarks.peer_loops.{peer.module}"]
+                worker = Worker(
+                    [*map(str, command), str(peer.seeds), str(STEPS)], measuring.one_core()
+                )
+                assert worker.facts
+            except (RuntimeError, OSError, subprocess.CalledProcessError) as error:
+                entry["error"] = str(error)
+                continue
+            entry["versions"] = versions(python)
+            measured.append(peer)
+            workers.append((worker, STEPS, float(peer.seeds * STEPS)))
+        assert workers[0][0].facts
+        # Some compile again at their second call.
+        measuring.in_turn(workers, 1)
+        our_rates, *rates = measuring.in_turn(workers, options.rounds)
+    finally:
+        for worker, _, _ in workers:
+            worker.stop()
+    for peer, peer_rates in zip(measured, rates, strict=True):
+        entry = next(entry for entry in entries if entry["module"] == peer.module)
+        ratio = measuring.compare("peers", f"ours / {peer.name}", our_rates, peer_rates)
+        entry["learning_steps_per_second"] = statistics.median(peer_rates)
+        entry["ratio"] = dataclasses.asdict(ratio)
+    result = {
+        "command": "python -m benchmarks.peers " + " ".join(sys.argv[1:]),
+        "date": datetime.date.today().isoformat(),
+        "machine": measuring.machine(),
+        "versions": measuring.versions(),
+        "ours": {"seeds": ours.seeds, "learning_steps_per_second": statistics.median(our_rates)},
+        "peers": entries,
+    }
+    console.print(table(result))
+    if options.json is not None:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps(result, indent=1) + "\n")
+    return 0
+
+
+def table(result: dict[str, Any]) -> Table:
+    """The rates, and what is not the same work."""
+    shown = Table(box=box.SIMPLE, title="learning steps per second on one core, medians")
+    shown.add_column("loop")
+    for name in ("seeds", "steps/s", "ours is faster"):
+        shown.add_column(name, justify="right")
+    shown.add_column("not the same work")
+    ours = result["ours"]
+    rate = f"{ours['learning_steps_per_second']:,.0f}"
+    shown.add_row("cmedirl_jax DDPG", str(ours["seeds"]), rate, "", "")
+    for entry in result["peers"]:
+        if "error" in entry:
+            shown.add_row(entry["name"], str(entry["seeds"]), "not installed", "", entry["error"])
+            continue
+        shown.add_row(
+            entry["name"],
+            str(entry["seeds"]),
+            f"{entry['learning_steps_per_second']:,.0f}",
+            f"{entry['ratio']['median']:.1f}x",
+            entry["difference"],
+        )
+    return shown
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Options, prog="python -m benchmarks.peers")))
