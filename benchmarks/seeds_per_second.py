@@ -36,7 +36,8 @@ class Options:
     quick: bool = False
     """DDPG at 100 seeds alone, on one device and on all: within a minute."""
     suites: tuple[str, ...] = ()
-    """Only these parts of the whole; see the names in the JSON."""
+    """Only these parts of the whole: seeds, width, batch, method, scale, devices, ended,
+    demonstrations, group, compilation."""
     devices: int | None = None
     """Devices of the workloads that use several; default: every core, or every GPU."""
     rounds: int | None = None
@@ -123,7 +124,14 @@ def main(options: Options) -> int:
     comparisons: list[Comparison] = []
     devices = options.devices or measuring.cores()
     rounds = options.rounds or (3 if options.quick else 5)
-    for suite in suites(devices, options.quick):
+    everything = list(suites(devices, options.quick))
+    names = list(dict.fromkeys([suite.name for suite in everything] + ["compilation"]))
+    for name in options.suites:
+        if name not in names:
+            message = f"--suites: unknown suite {name!r}; there are {', '.join(names)}"
+            print(f"seeds_per_second: {message}", file=sys.stderr)
+            return 2
+    for suite in everything:
         if options.suites and suite.name not in options.suites:
             continue
         found = measuring.measure(suite.workloads, rounds, compile_together=options.quick)
@@ -133,7 +141,7 @@ def main(options: Options) -> int:
             for name, above, below in suite.ratios
         ]
         for comparison in comparisons[-len(suite.ratios) :]:
-            console.print(_line(comparison), highlight=False)
+            console.print(_line(comparison), highlight=False, soft_wrap=True)
     whole = not options.quick and (not options.suites or "compilation" in options.suites)
     result = {
         "command": "python -m benchmarks.seeds_per_second " + " ".join(sys.argv[1:]),

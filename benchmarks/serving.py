@@ -11,6 +11,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,6 +20,10 @@ try:
     import resource
 except ImportError:  # Windows has no such accounting; the memory is then not reported.
     resource = None
+
+
+_MARK = "answer: "
+"""Begins the lines that are answers: libraries print as they are imported."""
 
 
 def serve(advance: Callable[[int], Any], steps: int, facts: Callable[[], dict] = dict) -> None:
@@ -30,16 +35,20 @@ def serve(advance: Callable[[int], Any], steps: int, facts: Callable[[], dict] =
         facts: what else to report after that call.
     """
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
+
+    def answer(found: dict[str, Any]) -> None:
+        print(_MARK + json.dumps(found), file=answers)
+
     with contextlib.redirect_stdout(sys.stderr):
         began = time.perf_counter()
         advance(steps)
         first = time.perf_counter() - began
-        print(json.dumps({"first_call_seconds": first, **facts()}), file=answers)
+        answer({"first_call_seconds": first, **facts()})
         for line in sys.stdin:
             began = time.perf_counter()
             advance(int(line))
             seconds = time.perf_counter() - began
-            print(json.dumps({"seconds": seconds, "peak_memory_bytes": _peak()}), file=answers)
+            answer({"seconds": seconds, "peak_memory_bytes": _peak()})
 
 
 def serve_from_command_line(advance: Callable[[int], Any]) -> None:
@@ -60,11 +69,13 @@ class Worker:
         if cores is not None and hasattr(os, "sched_setaffinity"):
             pin = lambda: os.sched_setaffinity(0, cores)  # noqa: E731
         root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+        # A file: a pipe that nobody reads would block a process that complains a lot.
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=self._errors,
             text=True,
             preexec_fn=pin,
             env={**os.environ, "PYTHONPATH": root, **environment},
@@ -92,14 +103,16 @@ class Worker:
     def stop(self) -> None:
         """End the process."""
         self._process.communicate()
+        self._errors.close()
 
     def _answer(self) -> dict[str, Any]:
         assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            _, errors = self._process.communicate()
-            raise RuntimeError(f"{' '.join(map(str, self._process.args))}:\n{errors[-2000:]}")
-        return json.loads(line)
+        for line in self._process.stdout:
+            if line.startswith(_MARK):
+                return json.loads(line.removeprefix(_MARK))
+        self._process.wait()
+        self._errors.seek(0)
+        raise RuntimeError(self._errors.read()[-2000:])
 
 
 def _peak() -> int | None:

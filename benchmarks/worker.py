@@ -34,12 +34,14 @@ def main() -> None:
     jax.config.update("jax_num_cpu_devices", workload.devices)
     if jax.config.jax_compilation_cache_dir is not None:
         compilation.use_cache()
-    cost = compilation.cost()
     variant = {"ours": ours, "naive": naive}[workload.variant]
-    advance = variant.start(workload, demonstrations(workload.n_demos))
-    serve(
-        advance, steps, lambda: {"compile_seconds": cost.seconds, "platform": jax.default_backend()}
-    )
+    with compilation.counted() as cost:
+        advance = variant.start(workload, demonstrations(workload.n_demos))
+        serve(
+            advance,
+            steps,
+            lambda: {"compile_seconds": cost.seconds, "platform": jax.default_backend()},
+        )
 
 
 if __name__ == "__main__":

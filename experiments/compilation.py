@@ -1,7 +1,8 @@
 """The compiler's cache on disk, and the count of what compiling cost."""
 
+import contextlib
 import dataclasses
-import functools
+from collections.abc import Iterator
 
 import jax
 import platformdirs
@@ -16,12 +17,13 @@ _HIT, _MISS = "/jax/compilation_cache/cache_hits", "/jax/compilation_cache/cache
 
 @dataclasses.dataclass
 class Cost:
-    """What compiling has cost this process.
+    """What compiling has cost.
 
     Attributes:
-        seconds: spent on tracing, lowering, compiling and reading the cache.
+        seconds: spent on tracing, lowering, compiling and reading the cache. A function that is
+            traced within another counts in both, so this is never too little.
         hits: programs that were found in the cache.
-        misses: programs that were not.
+        misses: programs that were not, though the cache was in use.
     """
 
     seconds: float = 0.0
@@ -29,22 +31,26 @@ class Cost:
     misses: int = 0
 
 
-@functools.cache
-def cost() -> Cost:
-    """The cost since the first call, which begins the count; it goes on counting."""
-    total = Cost()
+@contextlib.contextmanager
+def counted() -> Iterator[Cost]:
+    """The cost of what is compiled in this block, as it grows."""
+    cost = Cost()
 
     def spent(event: str, seconds: float, **_: str | int) -> None:
         if event in _DURATIONS:
-            total.seconds += seconds
+            cost.seconds += seconds
 
     def happened(event: str, **_: str | int) -> None:
-        total.hits += event == _HIT
-        total.misses += event == _MISS
+        cost.hits += event == _HIT
+        cost.misses += event == _MISS
 
     jax.monitoring.register_event_duration_secs_listener(spent)
     jax.monitoring.register_event_listener(happened)
-    return total
+    try:
+        yield cost
+    finally:
+        jax.monitoring.unregister_event_duration_listener(spent)
+        jax.monitoring.unregister_event_listener(happened)
 
 
 def use_cache() -> None:

@@ -16,6 +16,7 @@ from cmedirl_jax.methods import METHODS, Method, Settings
 from cmedirl_jax.networks import Architecture
 from experiments import (
     cells,
+    compilation,
     experts,
     figures,
     gymnasium_replay,
@@ -63,7 +64,13 @@ def run(grid: Grid, devices: list[jax.Device], console: Console) -> pl.DataFrame
     if todo:
         kind = devices[0].platform.upper()
         console.print(f"{grid.seeds} seeds per cell on {len(devices)} {kind} device(s)")
-        _train_cells(grid, env, keys, given, todo, devices, console)
+        with compilation.counted() as cost:
+            _train_cells(grid, env, keys, given, todo, devices, console)
+        console.print(
+            f"Compilation took {cost.seconds:.1f} s; {cost.hits} programs came from the cache, "
+            f"{cost.misses} did not",
+            highlight=False,
+        )
     return _conclude(grid, env, folder, plan, redraw=bool(todo))
 
 

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import dataclasses
 import os
 import sys
 from collections.abc import Sequence
@@ -27,8 +26,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console()
     if not console.is_terminal:
         console = Console(width=120)
-    cost = compilation.cost()
-    before = dataclasses.replace(cost)
     compilation.use_cache()
     try:
         # Before anything else: the first array that JAX makes fixes the number of CPU devices.
@@ -43,11 +40,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
     if summary["diverged"].sum():
         console.print(f"Seeds that diverged and were stopped: {summary['diverged'].sum()}")
-    console.print(
-        f"Compilation: {cost.seconds - before.seconds:.1f} s; {cost.hits - before.hits} programs "
-        f"from the cache, {cost.misses - before.misses} new",
-        highlight=False,
-    )
     console.print(f"Tables and figures: {grid.folder}", highlight=False, soft_wrap=True)
     return 0
 

@@ -1,6 +1,7 @@
 import hypothesis
 import jax
 import numpy as np
+import platformdirs
 import pytest
 
 from cmedirl_jax import envs
@@ -9,6 +10,15 @@ from cmedirl_jax.types import EnvSpec
 # The first example of a test compiles, so deadlines would only measure the compiler.
 hypothesis.settings.register_profile("reproducible", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("reproducible")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def no_users_cache(tmp_path_factory):
+    """Commands run within the tests' process leave nothing in the user's cache."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(platformdirs, "user_cache_path", lambda *_, **__: folder)
+        yield
 
 
 @pytest.fixture(autouse=True)
