@@ -14,6 +14,7 @@ from typing import Any
 
 from benchmarks.serving import Worker
 from benchmarks.workload import CAPACITY, Workload
+from experiments.run_grid import cores
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
 
@@ -141,11 +142,6 @@ def steps_per_call(workload: Workload) -> int:
 def one_core() -> list[int] | None:
     """The last of the cores that this process may use; None where that cannot be said."""
     return sorted(os.sched_getaffinity(0))[-1:] if hasattr(os, "sched_getaffinity") else None
-
-
-def cores() -> int:
-    """How many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def machine() -> dict[str, Any]:

@@ -65,18 +65,22 @@ def start_devices(grid: Grid) -> list[jax.Device]:
     Raises:
         UserError: if more devices are asked for than there are.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     # A device wants a few seeds to itself: fewer than four a device do not fill a vector unit.
-    wanted = grid.devices or max(1, min(cores or 1, grid.seeds // 4))
-    if grid.devices is None or 1 <= grid.devices <= (cores or 1):
+    wanted = grid.devices or max(1, min(cores(), grid.seeds // 4))
+    if grid.devices is None or 1 <= grid.devices <= cores():
         # Once JAX has started (a second call in one process) it keeps the devices it has.
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", wanted)
     devices = jax.devices()
-    available = len(devices) if devices[0].platform != "cpu" else cores or 1
+    available = len(devices) if devices[0].platform != "cpu" else cores()
     if grid.devices is not None and grid.devices > available:
         raise UserError(f"--devices: {grid.devices} asked, there are {available}")
     return devices[: max(grid.devices, 1)] if grid.devices is not None else devices
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def summary_table(summary: pl.DataFrame) -> Table:

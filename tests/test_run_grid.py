@@ -253,7 +253,7 @@ def test_a_run_leaves_what_the_design_lists_and_nothing_unfinished(smoke):
     assert json.loads((folder / "config.json").read_text())["config"]["seeds"] == SEEDS
     assert "[1/5] experts" in done.stdout
     # Any array made before the devices are started would leave one.
-    assert f"on {min(os.cpu_count(), 2)} CPU device(s)" in done.stdout
+    assert f"on {min(run_grid.cores(), 2)} CPU device(s)" in done.stdout
     assert str(folder) in done.stdout
 
 
@@ -355,7 +355,7 @@ def test_a_run_cut_off_between_cells_resumes_to_the_same_tables(smoke, compiled,
     assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
 
 
-@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="there is one core")
+@pytest.mark.skipif(run_grid.cores() < 2, reason="there is one core")
 def test_seeds_do_not_depend_on_the_devices_that_share_them(tmp_path, compiled):
     returns = []
     for devices in (1, 2):
