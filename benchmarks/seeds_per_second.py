@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import measuring, plots
-from benchmarks.measuring import Comparison, Record
+from benchmarks.measuring import Comparison
 from benchmarks.workload import Workload
 from cmedirl_jax.methods import METHODS
 
@@ -120,8 +120,6 @@ def main(options: Options) -> int:
     """Measure, print and write."""
     assert set(METHOD_NAMES) <= set(METHODS)
     console = Console(width=None if sys.stdout.isatty() else 120)
-    records: list[tuple[str, Record]] = []
-    comparisons: list[Comparison] = []
     devices = options.devices or measuring.cores()
     rounds = options.rounds or (3 if options.quick else 5)
     everything = list(suites(devices, options.quick))
@@ -131,33 +129,39 @@ def main(options: Options) -> int:
             message = f"--suites: unknown suite {name!r}; there are {', '.join(names)}"
             print(f"seeds_per_second: {message}", file=sys.stderr)
             return 2
-    for suite in everything:
-        if options.suites and suite.name not in options.suites:
-            continue
-        found = measuring.measure(suite.workloads, rounds, compile_together=options.quick)
-        records += [(suite.name, record) for record in found]
-        comparisons += [
-            measuring.compare(suite.name, name, found[above].rates, found[below].rates)
-            for name, above, below in suite.ratios
-        ]
-        for comparison in comparisons[-len(suite.ratios) :]:
-            console.print(_line(comparison), highlight=False, soft_wrap=True)
-    whole = not options.quick and (not options.suites or "compilation" in options.suites)
-    result = {
+    result: dict[str, Any] = {
         "command": "python -m benchmarks.seeds_per_second " + " ".join(sys.argv[1:]),
         "date": datetime.date.today().isoformat(),
         "machine": measuring.machine(),
         "versions": measuring.versions(),
-        "records": [{"suite": suite, **record.fields()} for suite, record in records],
-        "comparisons": [dataclasses.asdict(comparison) for comparison in comparisons],
-        "compilation": compilation_times() if whole else [],
+        "records": [],
+        "comparisons": [],
+        "compilation": [],
     }
+    for suite in everything:
+        if options.suites and suite.name not in options.suites:
+            continue
+        found = measuring.measure(suite.workloads, rounds, compile_together=options.quick)
+        result["records"] += [{"suite": suite.name, **record.fields()} for record in found]
+        for name, above, below in suite.ratios:
+            ratio = measuring.compare(suite.name, name, found[above].rates, found[below].rates)
+            console.print(_line(ratio), highlight=False, soft_wrap=True)
+            result["comparisons"].append(dataclasses.asdict(ratio))
+        # After each suite: the whole takes most of an hour, and none of it should be lost.
+        write(result, options.json)
+    if "compilation" in (options.suites or ("compilation",)) and not options.quick:
+        result["compilation"] = compilation_times()
+        write(result, options.json)
     console.print(table(result["records"]))
-    if options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(result, indent=1) + "\n")
-        plots.growth(result["records"], options.json.with_suffix(".png"))
     return 0
+
+
+def write(result: dict[str, Any], path: Path | None) -> None:
+    """Write the measurements so far, and draw what there is."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(result, indent=1) + "\n")
+        plots.growth(result["records"], path.with_suffix(".png"))
 
 
 def table(records: list[dict[str, Any]]) -> Table:
