@@ -5,6 +5,7 @@ All loops use the same networks, batch and replay and take one update per enviro
 timed in turn. What is not the same work is printed with the numbers.
 """
 
+import contextlib
 import dataclasses
 import datetime
 import json
@@ -12,6 +13,7 @@ import os
 import statistics
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -93,21 +95,21 @@ class Options:
     """File for the measurements."""
 
 
-def environment(peer: Peer, folder: Path) -> Path:
-    """The Python of the peer's environment, which is made if it is not there.
+def environment(name: str, requirements: Sequence[str], folder: Path) -> Path:
+    """The Python of the environment `name` below `folder`, made if it does not hold all of it.
 
     Raises:
         RuntimeError: if something cannot be installed, with the end of what the installer said.
     """
-    root = folder / peer.module
+    root = folder / name
     python = root / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
     ready = root / "requirements.txt"
-    wanted = "\n".join(peer.requirements)
+    wanted = "\n".join(requirements)
     if ready.exists() and ready.read_text() == wanted:
         return python
     subprocess.run([sys.executable, "-m", "venv", "--clear", root], check=True)
     installed = subprocess.run(
-        [python, "-m", "pip", "install", "--quiet", *peer.requirements],
+        [python, "-m", "pip", "install", "--quiet", *requirements],
         capture_output=True,
         text=True,
         check=False,
@@ -133,37 +135,34 @@ def main(options: Options) -> int:
     """Install, measure, print and write."""
     console = Console(width=None if sys.stdout.isatty() else 140)
     ours = Workload()
-    workers = [(measuring.start(ours, STEPS), STEPS, float(ours.seeds * STEPS))]
-    measured: list[Peer] = []
-    entries: list[dict[str, Any]] = []
-    try:
-        for peer in (peer for peer in PEERS if peer.module in options.peers):
-            console.print(f"{peer.name}: preparing")
-            entry: dict[str, Any] = peer._asdict()
-            entries.append(entry)
+    entries: list[dict[str, Any]] = [
+        peer._asdict() for peer in PEERS if peer.module in options.peers
+    ]
+    with contextlib.ExitStack() as running:
+        our_worker = measuring.start(ours, STEPS)
+        running.callback(our_worker.stop)
+        workers = [(our_worker, STEPS, float(ours.seeds * STEPS))]
+        for entry in entries:
+            console.print(f"{entry['name']}: preparing")
             try:
-                python = environment(peer, options.environments)
-                command = [python, "-m", f"benchmarks.peer_loops.{peer.module}"]
-                worker = Worker(
-                    [*map(str, command), str(peer.seeds), str(STEPS)], measuring.one_core()
-                )
+                python = environment(entry["module"], entry["requirements"], options.environments)
+                command = [str(python), "-m", f"benchmarks.peer_loops.{entry['module']}"]
+                sizes = [str(entry["seeds"]), str(STEPS)]
+                worker = Worker([*command, *sizes], measuring.one_core())
+                running.callback(worker.stop)
                 assert worker.facts
             except (RuntimeError, OSError, subprocess.CalledProcessError) as error:
                 entry["error"] = str(error)
                 continue
             entry["versions"] = versions(python)
-            measured.append(peer)
-            workers.append((worker, STEPS, float(peer.seeds * STEPS)))
-        assert workers[0][0].facts
+            workers.append((worker, STEPS, float(entry["seeds"] * STEPS)))
+        assert our_worker.facts
         # Some compile again at their second call.
         measuring.in_turn(workers, 1)
         our_rates, *rates = measuring.in_turn(workers, options.rounds)
-    finally:
-        for worker, _, _ in workers:
-            worker.stop()
-    for peer, peer_rates in zip(measured, rates, strict=True):
-        entry = next(entry for entry in entries if entry["module"] == peer.module)
-        ratio = measuring.compare("peers", f"ours / {peer.name}", our_rates, peer_rates)
+    measured = (entry for entry in entries if "error" not in entry)
+    for entry, peer_rates in zip(measured, rates, strict=True):
+        ratio = measuring.compare("peers", f"ours / {entry['name']}", our_rates, peer_rates)
         entry["learning_steps_per_second"] = statistics.median(peer_rates)
         entry["ratio"] = dataclasses.asdict(ratio)
     result = {

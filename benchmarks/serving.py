@@ -26,6 +26,13 @@ _MARK = "answer: "
 """Begins the lines that are answers: libraries print as they are imported."""
 
 
+_PIN = """
+import os, sys
+os.sched_setaffinity(0, map(int, sys.argv[1].split(",")))
+os.execv(sys.argv[2], sys.argv[2:])
+"""
+
+
 def serve(advance: Callable[[int], Any], steps: int, facts: Callable[[], dict] = dict) -> None:
     """Time `advance(steps)` whenever asked to, until standard input ends.
 
@@ -65,9 +72,9 @@ class Worker:
 
     def __init__(self, command: Sequence[str], cores: Sequence[int] | None, **environment: str):
         """Start `command`, on `cores` alone where given and where the system can do that."""
-        pin = None
         if cores is not None and hasattr(os, "sched_setaffinity"):
-            pin = lambda: os.sched_setaffinity(0, cores)  # noqa: E731
+            # By a first program: pinning in a fork is unsafe where JAX has started its threads.
+            command = [sys.executable, "-c", _PIN, ",".join(map(str, cores)), *command]
         root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
         # A file: a pipe that nobody reads would block a process that complains a lot.
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115
@@ -77,7 +84,6 @@ class Worker:
             stdout=subprocess.PIPE,
             stderr=self._errors,
             text=True,
-            preexec_fn=pin,
             env={**os.environ, "PYTHONPATH": root, **environment},
         )
         self.peak_memory_bytes: int | None = None

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -45,10 +46,20 @@ def test_a_worker_times_its_loop_and_nothing_else(worker):
         assert 1e6 < worker.peak_memory_bytes < 1e9
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="processes cannot be pinned here")
+def test_a_worker_runs_on_its_core_alone():
+    code = LOOP.replace('"answer": 42', '"cores": sorted(__import__("os").sched_getaffinity(0))')
+    (core,) = measuring.one_core()
+    worker = Worker([sys.executable, "-c", code, "1"], [core])
+    assert worker.facts["cores"] == [core]
+    worker.stop()
+
+
 def test_a_worker_that_fails_says_why():
     broken = Worker([sys.executable, "-c", "raise SystemExit('no such thing')"], None)
     with pytest.raises(RuntimeError, match="no such thing"):
         broken.facts  # noqa: B018
+    broken.stop()
 
 
 class FakeWorker:
@@ -156,8 +167,8 @@ def test_a_record_is_summed_up_by_its_median():
 
 
 def test_a_peer_that_cannot_be_installed_is_named(fake_start, monkeypatch, tmp_path, capsys):
-    def environment(peer, folder):
-        if peer.module == "rejax_td3":
+    def environment(name, requirements, folder):
+        if name == "rejax_td3":
             raise RuntimeError("there is no such version")
         return Path("python")
 
@@ -193,14 +204,13 @@ def test_a_peers_environment_is_made_once_and_again_for_other_requirements(tmp_p
         return subprocess.CompletedProcess(command, 0, "", "")
 
     monkeypatch.setattr(peers.subprocess, "run", run)
-    peer = PEERS[0]
-    python = peers.environment(peer, tmp_path)
-    assert python.is_relative_to(tmp_path / peer.module)
+    python = peers.environment("peer", ("this", "that==1"), tmp_path)
+    assert python.is_relative_to(tmp_path / "peer")
     assert [command[2] for command in commands] == ["venv", "pip"]
-    assert commands[1][-len(peer.requirements) :] == list(peer.requirements)
-    assert peers.environment(peer, tmp_path) == python
+    assert commands[1][-2:] == ["this", "that==1"]
+    assert peers.environment("peer", ("this", "that==1"), tmp_path) == python
     assert len(commands) == 2
-    peers.environment(peer._replace(requirements=("other",)), tmp_path)
+    peers.environment("peer", ("other",), tmp_path)
     assert len(commands) == 4
 
 
@@ -212,8 +222,8 @@ def test_an_installation_that_fails_is_not_taken_for_done(tmp_path, monkeypatch)
 
     monkeypatch.setattr(peers.subprocess, "run", run)
     with pytest.raises(RuntimeError, match="no matching thing"):
-        peers.environment(PEERS[0], tmp_path)
-    assert not (tmp_path / PEERS[0].module / "requirements.txt").exists()
+        peers.environment("peer", ("this",), tmp_path)
+    assert not (tmp_path / "peer" / "requirements.txt").exists()
 
 
 @pytest.mark.parametrize("peer", PEERS, ids=lambda peer: peer.module)
