@@ -15,6 +15,7 @@ from benchmarks.measuring import Record
 from benchmarks.peers import PEERS
 from benchmarks.serving import Worker
 from benchmarks.workload import Workload
+from experiments import cells
 from tests import pools
 
 TINY = {"seeds": 3, "hidden": (4, 4), "batch": 4}
@@ -102,6 +103,26 @@ def test_a_workload_advances_all_its_seeds(variant, method):
     advance = variant.start(Workload(method=method, n_demos=2, **TINY), pools.scripted())
     advance(5)
     advance(5)
+
+
+def test_every_timed_step_learns(monkeypatch):
+    logs = []
+    compile_method = cells.compile_method
+
+    def compile_and_listen(*args, **kwargs):
+        programs = compile_method(*args, **kwargs)
+
+        def run(*args):
+            state, log = programs.run(*args)
+            logs.append(log)
+            return state, log
+
+        return programs._replace(run=run)
+
+    monkeypatch.setattr(cells, "compile_method", compile_and_listen)
+    ours.start(Workload(**TINY), pools.scripted())(5)
+    assert np.all(logs[0].learned)
+    assert np.all(np.asarray(logs[0].critic_loss)[:, 1:] > 0.0)
 
 
 def test_a_workload_can_leave_out_seeds_that_have_ended():
