@@ -1,6 +1,7 @@
 """Workloads timed in turn, each in a process of its own, and what is written about them."""
 
 import dataclasses
+import datetime
 import importlib.metadata
 import itertools
 import json
@@ -103,10 +104,11 @@ def measure(
         for workload in workloads:
             workers += [start(workload, steps_per_call(workload))]
             if not compile_together:
-                workers[-1].facts  # noqa: B018
+                workers[-1].wait()
         asked = []
         for worker, workload in zip(workers, workloads, strict=True):
-            assert worker.facts
+            # Nothing is timed while another still compiles.
+            worker.wait()
             steps = steps_per_call(workload)
             asked.append((worker, steps, workload.seeds * workload.running * steps))
         rates = in_turn(asked, rounds)
@@ -142,6 +144,22 @@ def steps_per_call(workload: Workload) -> int:
 def one_core() -> list[int] | None:
     """The last of the cores that this process may use; None where that cannot be said."""
     return sorted(os.sched_getaffinity(0))[-1:] if hasattr(os, "sched_getaffinity") else None
+
+
+def heading(program: str) -> dict[str, Any]:
+    """What every file of measurements begins with."""
+    return {
+        "command": f"python -m benchmarks.{program} " + " ".join(sys.argv[1:]),
+        "date": datetime.date.today().isoformat(),
+        "machine": machine(),
+        "versions": versions(),
+    }
+
+
+def write(result: dict[str, Any], path: Path) -> None:
+    """Write a file of measurements, and the folder that it lies in."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(result, indent=1) + "\n")
 
 
 def machine() -> dict[str, Any]:

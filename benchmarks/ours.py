@@ -14,7 +14,6 @@ from cmedirl_jax.methods import METHODS, Settings
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.schedules import RewardSchedule, Schedule
 from experiments import cells, judging
-from experiments.lanes import Lanes
 
 
 def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
@@ -48,15 +47,11 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         subset_size=workload.n_demos,
     )
     data = hot_start.data(pool) if METHODS[workload.method].uses_demonstrations else None
-    lanes = Lanes(programs.lanes, workload.seeds, group, len(devices))
-    active = np.arange(workload.seeds) < round(workload.running * workload.seeds)
-    keys = seeds.keys(jax.random.key(0), programs.lanes)[lanes.seed]
-    everyone = lanes.groups(np.ones(workload.seeds, bool))
-    state = programs.init(keys, everyone, data, workload.n_demos)
-    move = lanes.pack(np.random.default_rng(0).permutation(active))
-    if move is not None:
-        state = programs.permute(state, move)
-    groups = -(-int(active.sum()) // (group * len(devices)))
+    key = jax.random.key(0)
+    lanes, state, _ = cells.begin(programs, key, data, workload.n_demos, workload.seeds)
+    running = np.arange(workload.seeds) < round(workload.running * workload.seeds)
+    active = np.random.default_rng(0).permutation(running)
+    state, groups = cells.pack(programs, lanes, state, active)
     taken = 0
 
     def advance(steps: int) -> None:

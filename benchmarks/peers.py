@@ -7,7 +7,6 @@ timed in turn. What is not the same work is printed with the numbers.
 
 import contextlib
 import dataclasses
-import datetime
 import json
 import os
 import statistics
@@ -150,13 +149,12 @@ def main(options: Options) -> int:
                 sizes = [str(entry["seeds"]), str(STEPS)]
                 worker = Worker([*command, *sizes], measuring.one_core())
                 running.callback(worker.stop)
-                assert worker.facts
+                worker.wait()
             except (RuntimeError, OSError, subprocess.CalledProcessError) as error:
                 entry["error"] = str(error)
                 continue
             entry["versions"] = versions(python)
             workers.append((worker, STEPS, float(entry["seeds"] * STEPS)))
-        assert our_worker.facts
         # Some compile again at their second call.
         measuring.in_turn(workers, 1)
         our_rates, *rates = measuring.in_turn(workers, options.rounds)
@@ -166,17 +164,13 @@ def main(options: Options) -> int:
         entry["learning_steps_per_second"] = statistics.median(peer_rates)
         entry["ratio"] = dataclasses.asdict(ratio)
     result = {
-        "command": "python -m benchmarks.peers " + " ".join(sys.argv[1:]),
-        "date": datetime.date.today().isoformat(),
-        "machine": measuring.machine(),
-        "versions": measuring.versions(),
+        **measuring.heading("peers"),
         "ours": {"seeds": ours.seeds, "learning_steps_per_second": statistics.median(our_rates)},
         "peers": entries,
     }
     console.print(table(result))
     if options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(result, indent=1) + "\n")
+        measuring.write(result, options.json)
     return 0
 
 

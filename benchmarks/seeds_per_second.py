@@ -5,9 +5,7 @@ speed drifts. A workload of one device runs on one core.
 """
 
 import dataclasses
-import datetime
 import itertools
-import json
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -24,7 +22,7 @@ from benchmarks.measuring import Comparison
 from benchmarks.workload import Workload
 from cmedirl_jax.methods import METHODS
 
-METHOD_NAMES = ("ddpg", "hs-ddpg", "me-ddpg", "hs-me-ddpg")
+METHOD_NAMES = tuple(METHODS)
 SEEDS = (1, 8, 32, 100, 1000)
 WIDTHS = ((64, 64), (128, 128), (400, 300))
 
@@ -118,7 +116,6 @@ def compilation_times() -> list[dict[str, Any]]:
 
 def main(options: Options) -> int:
     """Measure, print and write."""
-    assert set(METHOD_NAMES) <= set(METHODS)
     console = Console(width=None if sys.stdout.isatty() else 120)
     devices = options.devices or measuring.cores()
     rounds = options.rounds or (3 if options.quick else 5)
@@ -130,10 +127,7 @@ def main(options: Options) -> int:
             print(f"seeds_per_second: {message}", file=sys.stderr)
             return 2
     result: dict[str, Any] = {
-        "command": "python -m benchmarks.seeds_per_second " + " ".join(sys.argv[1:]),
-        "date": datetime.date.today().isoformat(),
-        "machine": measuring.machine(),
-        "versions": measuring.versions(),
+        **measuring.heading("seeds_per_second"),
         "records": [],
         "comparisons": [],
         "compilation": [],
@@ -159,8 +153,7 @@ def main(options: Options) -> int:
 def write(result: dict[str, Any], path: Path | None) -> None:
     """Write the measurements so far, and draw what there is."""
     if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(result, indent=1) + "\n")
+        measuring.write(result, path)
         plots.growth(result["records"], path.with_suffix(".png"))
 
 

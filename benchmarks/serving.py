@@ -97,8 +97,13 @@ class Worker:
         """
         return self._answer()
 
+    def wait(self) -> None:
+        """Until its first call is done; raises what `facts` raises."""
+        _ = self.facts
+
     def seconds(self, steps: int) -> float:
-        """How long its learners take for so many steps each; once `facts` are there."""
+        """How long its learners take for so many steps each, after the first call."""
+        self.wait()
         assert self._process.stdin is not None
         self._process.stdin.write(f"{steps}\n")
         self._process.stdin.flush()

@@ -114,6 +114,26 @@ def compile_method(
     )
 
 
+def begin(
+    programs: Programs, key: jax.Array, data: HotStartData | None, n_demos: int, seeds_count: int
+) -> tuple[Lanes, TrainingState, int]:
+    """Initialise a cell's seeds: their lanes, their states, and how many groups hold them."""
+    lanes = Lanes(programs.lanes, seeds_count, programs.group, programs.devices)
+    groups = lanes.groups(np.ones(seeds_count, bool))
+    keys = seeds.keys(key, programs.lanes)[lanes.seed]
+    return lanes, programs.init(keys, groups, data, n_demos), groups
+
+
+def pack(
+    programs: Programs, lanes: Lanes, state: TrainingState, active: np.ndarray
+) -> tuple[TrainingState, int]:
+    """Bring the seeds `active` `[seeds]` to the front; how many groups hold them now."""
+    move = lanes.pack(active)
+    if move is not None:
+        state = programs.permute(state, move)
+    return state, lanes.groups(active)
+
+
 def train(
     programs: Programs,
     key: jax.Array,
@@ -126,15 +146,13 @@ def train(
     report: Callable[[Progress], None],
 ) -> CellResult:
     """Train a cell on `data` (None for a method without demonstrations), reporting each chunk."""
-    lanes = Lanes(programs.lanes, seeds_count, programs.group, programs.devices)
-    groups = lanes.groups(np.ones(seeds_count, bool))
-    keys = seeds.keys(key, programs.lanes)[lanes.seed]
-    state = programs.init(keys, groups, data, n_demos)
+    lanes, state, groups = begin(programs, key, data, n_demos, seeds_count)
     book = Book(seeds_count, budget)
 
     def of_seeds(tree: Any) -> Any:
         """What lies in lanes, `[lanes, ...]`, as numpy `[seeds, ...]`."""
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes.of_seed], tree)
+        index = lanes.of_seed
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
 
     def evaluate(starts: int) -> Evaluation:
         found = programs.judge.on_starts(state.agent.actor, starts, groups)
@@ -148,10 +166,7 @@ def train(
     limit = None if budget.max_episodes is None else jnp.int32(budget.max_episodes)
     for start, stop in _chunks(budget.max_steps, budget.evaluate_every):
         active = book.running | (book.pending & ~book.diverged)
-        move = lanes.pack(active)
-        if move is not None:
-            state = programs.permute(state, move)
-        groups = lanes.groups(active)
+        state, groups = pack(programs, lanes, state, active)
         steps = jnp.arange(start, stop, dtype=jnp.int32)
         state, log = programs.run(state, groups, data, steps, limit)
         was_running = book.running.copy()
