@@ -127,6 +127,11 @@ class Worker:
 
 
 def _peak() -> int | None:
+    # Linux: what is accounted to a process includes that of the parent it was forked from.
+    if sys.platform == "linux":
+        with open("/proc/self/status") as status:
+            lines = dict(line.split(":", 1) for line in status)
+        return 1024 * int(lines["VmHWM"].split()[0])
     if resource is None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,5 +1,6 @@
 """Parity with Gymnasium's own MountainCarContinuous-v0, and what the port adds to it."""
 
+import chex
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -216,10 +217,10 @@ def test_observations_stay_in_the_spec_bounds(position, velocity, action):
 
 
 def test_other_values_do_not_recompile():
-    jitted = jax.jit(ENV.step)
+    # Fresh by its wrapper: jitted copies of one function share their compiled programs.
+    jitted = jax.jit(chex.assert_max_traces(ENV.step, n=1))
     jitted(KEY, state(-0.5, 0.0), jnp.array([0.1]), PARAMS)
     jitted(jax.random.key(1), state(0.2, 0.05, 7), jnp.array([-0.4]), PARAMS.replace(power=0.002))
-    assert jitted._cache_size() == 1
 
 
 def test_a_batch_of_one_equals_no_batch():
@@ -236,8 +237,3 @@ def test_step_keeps_shapes_and_dtypes():
     assert jax.tree.map(lambda x: (x.shape, x.dtype), result) == envs.Step(
         ((2,), jnp.float32), ((), jnp.float32), ((), jnp.bool_), ((), jnp.bool_)
     )
-
-
-def test_an_unknown_environment_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"'Pendulum-v0'.*MountainCarContinuous-v0"):
-        envs.make("Pendulum-v0")
