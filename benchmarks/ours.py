@@ -40,6 +40,7 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         METHODS[workload.method],
         settings,
         judging.make(env, settings.architecture, group, devices),
+        cells.compile_networks(env, settings.architecture, group, devices),
         group=group,
         seeds_count=workload.seeds,
         devices=devices,

@@ -86,6 +86,7 @@ class UpdateFn(Protocol):
         *,
         update_actor: Numeric = True,
         update_targets: Numeric = True,
+        clone: Numeric = True,
     ) -> tuple[DDPGState, DDPGInfo]:
         """Update on `batch`, leaves `[B, ...]`, whose rewards are those to learn from.
 
@@ -95,6 +96,7 @@ class UpdateFn(Protocol):
             demonstrations: `[D, ...]` for the behaviour-cloning term, or None to leave it out.
             update_actor: bool, or a scalar predicate that must not be batched under vmap.
             update_targets: likewise; "every 300 steps" is a predicate and tau = 1.
+            clone: likewise; add the behaviour-cloning term, where there are demonstrations.
 
         Raises:
             ValueError: if the batch's shapes are not `[B, O]`, `[B, A]` and `[B]`.
@@ -178,10 +180,23 @@ def make(
         )
         return state, loss, jnp.mean(q)
 
-    def update_actor_params(state: DDPGState, batch: Transition, demonstrations: Transition | None):
+    def update_actor_params(
+        state: DDPGState, batch: Transition, demonstrations: Transition | None, clone: Numeric
+    ):
         (loss, actor), grads = jax.value_and_grad(actor_loss, argnums=1, has_aux=True)(
-            networks, state.actor, state.critic, state.hparams, batch, demonstrations
+            networks, state.actor, state.critic, state.hparams, batch
         )
+        if demonstrations is not None:
+            # Apart from the loss above, so that a term that has faded out costs nothing.
+            cloning_loss, cloning_grads = _when(
+                clone,
+                lambda actor: jax.value_and_grad(behaviour_cloning_loss, argnums=1)(
+                    networks, actor, state.hparams, demonstrations
+                ),
+                lambda actor: (jnp.zeros(()), jax.tree.map(jnp.zeros_like, actor)),
+                actor,
+            )
+            loss, grads = jax.tree.map(jnp.add, (loss, grads), (cloning_loss, cloning_grads))
         updates, optimizer = actor_tx.update(
             grads, state.actor_optimizer, actor, learning_rate=state.hparams.actor_learning_rate
         )
@@ -204,6 +219,7 @@ def make(
         *,
         update_actor: Numeric = True,
         update_targets: Numeric = True,
+        clone: Numeric = True,
     ) -> tuple[DDPGState, DDPGInfo]:
         checks.transition_shapes(spec, batch, batch.observation.shape[:1], "batch")
         if demonstrations is not None:
@@ -212,7 +228,7 @@ def make(
         state, critic_loss_value, q_mean = update_critic(state, batch)
         state, actor_loss_value = _when(
             update_actor,
-            lambda state: update_actor_params(state, batch, demonstrations),
+            lambda state: update_actor_params(state, batch, demonstrations, clone),
             lambda state: (state, jnp.zeros(())),
             state,
         )
@@ -240,22 +256,22 @@ def critic_loss(
 
 
 def actor_loss(
-    networks: ActorCritic,
-    actor: Params,
-    critic: Params,
-    hparams: DDPGHParams,
-    batch: Transition,
-    demonstrations: Transition | None,
+    networks: ActorCritic, actor: Params, critic: Params, hparams: DDPGHParams, batch: Transition
 ) -> tuple[jax.Array, Params]:
-    """-1/B sum_i Q(s_i, mu(s_i)), whose gradient is Eq. 3's, plus the two optional penalties."""
+    """-1/B sum_i Q(s_i, mu(s_i)), whose gradient is Eq. 3's, plus the pre-activation penalty."""
     pre_activation, actor = networks_lib.train_mode(networks.actor)(actor, batch.observation)
     q = networks.critic.apply(critic, batch.observation, networks.squash(pre_activation))
-    loss = -jnp.mean(q) + hparams.pre_activation_penalty * jnp.mean(jnp.square(pre_activation))
-    if demonstrations is not None:
-        imitated = networks_lib.policy(networks, actor, demonstrations.observation)
-        error = jnp.mean(jnp.square(imitated - demonstrations.action))
-        loss = loss + hparams.behaviour_cloning * error
-    return loss, actor
+    penalty = jnp.mean(jnp.square(pre_activation))
+    return -jnp.mean(q) + hparams.pre_activation_penalty * penalty, actor
+
+
+def behaviour_cloning_loss(
+    networks: ActorCritic, actor: Params, hparams: DDPGHParams, demonstrations: Transition
+) -> jax.Array:
+    """w 1/D sum_i |mu(s_i) - a_i|^2 on demonstrations `[D, ...]`, added to the actor's loss."""
+    pre_activation, _ = networks_lib.train_mode(networks.actor)(actor, demonstrations.observation)
+    error = networks.squash(pre_activation) - demonstrations.action
+    return hparams.behaviour_cloning * jnp.mean(jnp.square(error))
 
 
 def _when(predicate: Numeric, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:

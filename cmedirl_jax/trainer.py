@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 
 from cmedirl_jax import demonstrations as demonstrations_lib
-from cmedirl_jax import hot_start, methods, networks, schedules, updates
+from cmedirl_jax import hot_start, methods, schedules, updates
+from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.ddpg import DDPGState
 from cmedirl_jax.demonstrations import DemonstrationSubset
 from cmedirl_jax.envs import Env
@@ -25,7 +26,7 @@ from cmedirl_jax.irl import RewardState
 from cmedirl_jax.methods import Algorithm, Method, Settings
 from cmedirl_jax.replay import ReplayState
 from cmedirl_jax.schedules import Plan
-from cmedirl_jax.types import Numeric, Transition
+from cmedirl_jax.types import Numeric, Params, Transition
 from cmedirl_jax.updates import Draws
 
 
@@ -86,8 +87,11 @@ class Trainer(NamedTuple):
 
     Attributes:
         algorithm: the method's parts.
-        init: `(key, data, n_demonstrations) -> TrainingState`, hot start included. `data` is what
-            `hot_start.data` made of the pool, or None for methods without demonstrations.
+        draw_networks: `key -> (actor, critic)`, the parameters that `init` starts from. They are
+            the same for every method, so that one compiled program may draw them for all.
+        init: `(key, data, n_demonstrations, networks=None) -> TrainingState`, hot start included.
+            `data` is what `hot_start.data` made of the pool, or None for methods without
+            demonstrations; `networks` is what `draw_networks` gave, where that was called apart.
         run: `(state, data, steps, max_episodes=None) -> (TrainingState, Log)` for `steps` `[T]`
             int32, the numbers t, t + 1, ... of the environment steps to take. Under vmap leave
             `data`, `steps` and `max_episodes` unbatched: branches are taken by them. A seed that
@@ -96,6 +100,7 @@ class Trainer(NamedTuple):
     """
 
     algorithm: Algorithm
+    draw_networks: Callable[[jax.Array], tuple[Params, Params]]
     init: Callable[..., TrainingState]
     run: Callable[..., tuple[TrainingState, Log]]
     act: Callable[..., jax.Array]
@@ -136,13 +141,25 @@ def make(
     agent, learner, exploration, replay = algorithm
     update = updates.make(algorithm, method, settings)
 
-    def init(key: jax.Array, data: HotStartData | None, n_demonstrations: Numeric) -> TrainingState:
+    def split(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         # Apart from the steps' keys: folding i into a key gives the i-th key of its split.
         setup_key, steps_key = jax.random.split(key)
-        agent_key, fit_key, reward_key, env_key, noise_key, subset_key = jax.random.split(
-            setup_key, 6
-        )
+        return jax.random.split(setup_key, 6), steps_key
+
+    def draw_networks(key: jax.Array) -> tuple[Params, Params]:
+        (agent_key, *_), _ = split(key)
         state = agent.init(agent_key)
+        return state.actor, state.critic
+
+    def init(
+        key: jax.Array,
+        data: HotStartData | None,
+        n_demonstrations: Numeric,
+        networks: tuple[Params, Params] | None = None,
+    ) -> TrainingState:
+        (agent_key, fit_key, reward_key, env_key, noise_key, subset_key), steps_key = split(key)
+        if networks is None:
+            networks = draw_networks(key)
         subset = None
         if method.uses_demonstrations:
             if data is None:
@@ -151,19 +168,18 @@ def make(
                 subset_key, data.episodes, n_demonstrations, subset_size
             )
         if method.hot_start:
-            params = hot_start.fit(
+            networks = hot_start.fit(
                 fit_key,
                 agent.networks,
-                (state.actor, state.critic),
+                networks,
                 data,  # type: ignore[arg-type]
                 settings.hot_start,
                 subset=subset,
             )
-            state = agent.init(agent_key, params)
         env_state, observation = env.reset(env_key, env_params)
         return TrainingState(
             key=steps_key,
-            agent=state,
+            agent=agent.init(agent_key, networks),
             reward=learner.init(reward_key) if learner else None,
             storage=replay.init().storage,
             exploration=exploration.init(noise_key),
@@ -275,9 +291,9 @@ def make(
         return jax.lax.scan(body, state, (draws, plans))
 
     def act(params: Any, observation: jax.Array) -> jax.Array:
-        return networks.policy(agent.networks, params, observation)
+        return networks_lib.policy(agent.networks, params, observation)
 
-    return Trainer(algorithm, init, run, act)
+    return Trainer(algorithm, draw_networks, init, run, act)
 
 
 def _select(predicate: jax.Array, on_true: Any, on_false: Any) -> Any:

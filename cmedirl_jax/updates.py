@@ -113,6 +113,7 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
             batch,
             _rows(pool, draws.demonstrations[:agent_batch]),
             update_targets=update_targets,
+            clone=plan.cloning_weight > 0,
         )
         return agent_state.replace(hparams=hparams), info
 

@@ -11,7 +11,8 @@ from cmedirl_jax import seeds, training
 from cmedirl_jax.envs import Env
 from cmedirl_jax.evaluation import Evaluation
 from cmedirl_jax.hot_start import HotStartData
-from cmedirl_jax.methods import Method, Settings
+from cmedirl_jax.methods import METHODS, Method, Settings
+from cmedirl_jax.networks import Architecture
 from cmedirl_jax.training import Log, TrainingState
 from experiments import judging
 from experiments.bookkeeping import Book, Budget, EpisodeRows, EvaluationRows
@@ -76,11 +77,28 @@ class Programs(NamedTuple):
     devices: int
 
 
+def compile_networks(
+    env: Env, architecture: Architecture, group: int, devices: list[jax.Device]
+) -> Callable[[jax.Array, int], Any]:
+    """Jit the drawing of the networks that every method starts from: `(keys, groups) -> networks`.
+
+    Apart from `compile_method`, because the random numbers are most of what an `init` compiles.
+    """
+    trainer = training.make(env, METHODS["ddpg"], Settings(architecture), capacity=1)
+    drawn = seeds.step_groups(lambda key: (key, trainer.draw_networks(key)), group)
+
+    def draw(keys: jax.Array, groups: int) -> Any:
+        return seeds.map_devices(drawn, devices)(keys, groups)[1]
+
+    return jax.jit(draw, out_shardings=seeds.sharding(devices))
+
+
 def compile_method(
     env: Env,
     method: Method,
     settings: Settings,
     judge: Judge,
+    draw_networks: Callable[[jax.Array, int], Any],
     *,
     group: int,
     seeds_count: int,
@@ -94,17 +112,29 @@ def compile_method(
     def spread(function: Callable) -> Callable:
         return seeds.map_devices(seeds.step_groups(function, group), devices)
 
-    def init(keys: jax.Array, groups: int, data: HotStartData | None, n_demonstrations: int):
-        initial = spread(lambda key, *shared: (key, trainer.init(key, *shared)))
-        return initial(keys, groups, data, n_demonstrations)[1]
+    def start(
+        keys: jax.Array, networks: Any, groups: int, data: HotStartData | None, n_demos: int
+    ) -> TrainingState:
+        def of_seed(drawn: tuple[jax.Array, Any], *shared: Any):
+            key, networks = drawn
+            return drawn, trainer.init(key, *shared, networks)
+
+        return spread(of_seed)((keys, networks), groups, data, n_demos)[1]
 
     def permute(state: TrainingState, move: np.ndarray) -> TrainingState:
         return jax.tree.map(lambda leaf: leaf[move], state)
 
     # One sharding everywhere: another one, even if equivalent, would compile again.
     split = seeds.sharding(devices)
+    start = jax.jit(start, out_shardings=split)
+
+    def init(
+        keys: jax.Array, groups: int, data: HotStartData | None, n_demonstrations: int
+    ) -> TrainingState:
+        return start(keys, draw_networks(keys, groups), groups, data, n_demonstrations)
+
     return Programs(
-        init=jax.jit(init, out_shardings=split),
+        init=init,
         run=jax.jit(spread(trainer.run), donate_argnums=0, out_shardings=split),
         permute=jax.jit(permute, donate_argnums=0, out_shardings=split),
         judge=judge,

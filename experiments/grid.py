@@ -158,12 +158,17 @@ def _compiler(
         return judging.make(env, architecture, group(architecture), devices)
 
     @functools.cache
+    def draw_networks(architecture: Architecture) -> Callable:
+        return cells.compile_networks(env, architecture, group(architecture), devices)
+
+    @functools.cache
     def compile_method(method: Method, settings: Settings) -> Programs:
         return cells.compile_method(
             env,
             method,
             settings,
             judge(settings.architecture),
+            draw_networks(settings.architecture),
             group=group(settings.architecture),
             seeds_count=seeds_count,
             devices=devices,

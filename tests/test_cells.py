@@ -61,6 +61,7 @@ def programs(env):
         METHODS["ddpg"],
         settings,
         judging.make(short, settings.architecture, 2, devices),
+        cells.compile_networks(short, settings.architecture, 2, devices),
         group=2,
         seeds_count=SEEDS,
         devices=devices,

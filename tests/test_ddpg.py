@@ -1,3 +1,5 @@
+import itertools
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -147,19 +149,27 @@ def test_traced_predicates_do_what_python_ones_do_and_stay_branches_under_vmap()
     states = jax.vmap(agent.init)(jax.random.split(jax.random.key(0), 3))
     batches = jax.vmap(lambda key: random_batch(key, 4))(jax.random.split(jax.random.key(1), 3))
 
-    def update(state, batch, actor, targets):
-        return agent.update(state, batch, update_actor=actor, update_targets=targets)
+    def update(state, batch, actor, targets, clone):
+        predicates = {"update_actor": actor, "update_targets": targets, "clone": clone}
+        return agent.update(state, batch, batch, **predicates)
 
-    mapped = jax.vmap(update, in_axes=(0, 0, None, None))
-    for actor in (False, True):
-        for targets in (False, True):
-            traced, _ = jax.jit(mapped)(states, batches, jnp.asarray(actor), jnp.asarray(targets))
-            known, _ = jax.jit(
-                jax.vmap(lambda s, b, actor=actor, targets=targets: update(s, b, actor, targets))
-            )(states, batches)
-            chex.assert_trees_all_close(traced, known, rtol=1e-5, atol=1e-7)
-    jaxpr = jax.make_jaxpr(mapped)(states, batches, jnp.asarray(True), jnp.asarray(True))
-    assert sum(equation.primitive.name == "cond" for equation in jaxpr.eqns) == 2
+    mapped = jax.vmap(update, in_axes=(0, 0, None, None, None))
+    for predicates in itertools.product((False, True), repeat=3):
+        traced, _ = jax.jit(mapped)(states, batches, *map(jnp.asarray, predicates))
+        static = jax.vmap(lambda *args, predicates=predicates: update(*args, *predicates))
+        known, _ = jax.jit(static)(states, batches)
+        chex.assert_trees_all_close(traced, known, rtol=1e-5, atol=1e-7)
+    jaxpr = jax.make_jaxpr(mapped)(states, batches, *map(jnp.asarray, predicates))
+    assert str(jaxpr).count("cond[") == 3
+
+
+def test_without_cloning_the_demonstrations_change_nothing():
+    agent = plain_gradient_descent()
+    state = agent.init(jax.random.key(0))
+    batch, demonstrations = random_batch(jax.random.key(1), 8), random_batch(jax.random.key(2), 5)
+    chex.assert_trees_all_equal(
+        agent.update(state, batch, demonstrations, clone=False), agent.update(state, batch)
+    )
 
 
 def test_one_vmapped_seed_gives_what_the_unbatched_update_gives():
@@ -219,12 +229,18 @@ def test_batch_normalised_networks_train_and_move_their_statistics():
     architecture = Architecture(
         hidden=(8,), actor_normalisation="batch", critic_normalisation="batch"
     )
-    agent = ddpg.make(SPEC, networks=networks.make(SPEC, architecture))
+    hparams = DDPGHParams(behaviour_cloning=0.7)
+    agent = ddpg.make(SPEC, hparams, networks=networks.make(SPEC, architecture))
     before, batch = agent.init(jax.random.key(0)), random_batch(jax.random.key(1), 32)
     after, _ = jax.jit(agent.update)(before, batch)
     for name in ("actor", "critic"):
         old, new = (getattr(state, name)["batch_stats"] for state in (before, after))
         assert all(jax.tree.leaves(jax.tree.map(lambda a, b: bool((a != b).any()), old, new)))
+    # The demonstrations' term is no reason to fit running statistics by gradient.
+    cloned, _ = jax.jit(agent.update)(before, batch, random_batch(jax.random.key(2), 8))
+    chex.assert_trees_all_close(
+        cloned.actor["batch_stats"], after.actor["batch_stats"], rtol=1e-5, atol=1e-7
+    )
 
 
 @pytest.mark.parametrize("field", Transition._fields)
