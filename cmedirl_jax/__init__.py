@@ -15,6 +15,7 @@ from cmedirl_jax import (
     schedules,
     seeds,
     shaping,
+    tabular,
     training,
 )
 from cmedirl_jax.methods import METHODS, Method, Settings
@@ -41,5 +42,6 @@ __all__ = [
     "schedules",
     "seeds",
     "shaping",
+    "tabular",
     "training",
 ]

@@ -52,6 +52,8 @@ class Env(NamedTuple):
         step: see `StepFn`.
         starts: `(count, params) -> (states [count], observations [count, O])`, fixed start states
             evenly spread over the start distribution, for evaluation.
+        state_at: `(observation [O], params) -> state` at the start of its clock, where an
+            observation says all about the state; else None.
     """
 
     spec: EnvSpec
@@ -59,3 +61,4 @@ class Env(NamedTuple):
     reset: ResetFn
     step: StepFn
     starts: Callable[[int, Any], tuple[Any, jax.Array]]
+    state_at: Callable[[jax.Array, Any], Any] | None = None

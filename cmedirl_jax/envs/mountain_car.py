@@ -55,7 +55,7 @@ SPEC = EnvSpec(
 
 def make() -> Env:
     """The environment with Gymnasium's physics as default parameters."""
-    return Env(SPEC, MountainCarParams(), reset, step, starts)
+    return Env(SPEC, MountainCarParams(), reset, step, starts, state_at)
 
 
 def reset(key: jax.Array, params: MountainCarParams) -> tuple[MountainCarState, jax.Array]:
@@ -88,9 +88,15 @@ def step(
     return new_state, Step(_observe(new_state), reward, terminated, truncated)
 
 
+def state_at(observation: jax.Array, params: MountainCarParams) -> MountainCarState:
+    """The car at `observation` `[2]`, before its first step."""
+    del params
+    return MountainCarState(observation[0], observation[1], jnp.zeros((), jnp.int32))
+
+
 def _at_rest(position: jax.Array) -> tuple[MountainCarState, jax.Array]:
-    state = MountainCarState(position, jnp.zeros_like(position), jnp.zeros((), jnp.int32))
-    return state, _observe(state)
+    observation = jnp.stack([position, jnp.zeros_like(position)])
+    return MountainCarState(position, observation[1], jnp.zeros((), jnp.int32)), observation
 
 
 def _observe(state: MountainCarState) -> jax.Array:

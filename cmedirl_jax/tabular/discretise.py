@@ -1,0 +1,148 @@
+"""Low-dimensional environments as finite Markov decision processes.
+
+    mdp = discretise.make(env, (100, 100), (11,))
+    policy = soft_value_iteration(mdp.dynamics, mdp.reward, discount=0.99, absorbing=mdp.absorbing)
+    act = discretise.greedy(mdp, policy.action_values)
+
+The states are the points of a grid over the observations and one absorbing state where every
+terminated episode ends. A transition is the environment's own, from the point (or from several
+around it); where it leads is shared among the neighbouring points by multilinear weights.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax.envs import Env, Step
+from cmedirl_jax.tabular import interpolation
+from cmedirl_jax.tabular.dynamics import SparseDynamics
+from cmedirl_jax.tabular.interpolation import Grid
+
+
+class FiniteMDP(flax.struct.PyTreeNode):
+    """An environment on grids: `S` states, the last one absorbing, and `A` actions.
+
+    Attributes:
+        dynamics: P(s'|s,a), sparse.
+        reward: `[S, A]`, the environment's.
+        absorbing: `[S]` bool.
+        states: grid of the first `S - 1` states (static).
+        actions: grid of the actions (static).
+    """
+
+    dynamics: SparseDynamics
+    reward: jax.Array
+    absorbing: jax.Array
+    states: Grid = flax.struct.field(pytree_node=False)
+    actions: Grid = flax.struct.field(pytree_node=False)
+
+
+def make(
+    env: Env,
+    state_shape: Sequence[int],
+    action_shape: Sequence[int],
+    *,
+    params: Any = None,
+    subsamples: int = 1,
+) -> FiniteMDP:
+    """Discretise an environment whose steps do not draw random numbers.
+
+    Args:
+        env: whose `state_at` says which state an observation is of.
+        state_shape: points along each dimension of the observation.
+        action_shape: points along each dimension of the action.
+        params: default `env.default_params`.
+        subsamples: transitions per dimension that are averaged for each state, evenly spread over
+            the cell around its point; 1 takes the point itself.
+
+    Raises:
+        ValueError: if the environment has no `state_at`, an infinite bound, or other dimensions.
+    """
+    if env.state_at is None:
+        raise ValueError(f"{env.spec.id} does not say which state an observation is of")
+    if subsamples < 1:
+        raise ValueError(f"subsamples must be at least 1, got {subsamples}")
+    spec, state_at = env.spec, env.state_at
+    params = env.default_params if params is None else params
+    states = _over(spec.observation_low, spec.observation_high, state_shape)
+    actions = _over(spec.action_low, spec.action_high, action_shape)
+    within = (np.arange(subsamples) + 0.5) / subsamples - 0.5
+    offsets = np.stack(np.meshgrid(*[within] * len(states.shape)), axis=-1).reshape(
+        -1, len(states.shape)
+    )
+
+    def step(observation: jax.Array, action: jax.Array) -> Step:
+        inside = jnp.clip(observation, spec.observation_low, spec.observation_high)
+        return env.step(jax.random.key(0), state_at(inside, params), action, params)[1]
+
+    def of_pair(point: jax.Array, action: jax.Array):
+        around = point + offsets.astype(np.float32) * states.spacing.astype(np.float32)
+        found = jax.vmap(step, in_axes=(0, None))(around, action)
+        index, weight = interpolation.interpolate(states, found.observation)
+        index = jnp.where(found.terminated[:, None], states.size, index)
+        return index.ravel(), weight.ravel() / len(offsets), jnp.mean(found.reward)
+
+    over_actions = jax.vmap(of_pair, in_axes=(None, 0))
+    index, weight, reward = jax.vmap(over_actions, in_axes=(0, None))(
+        jnp.asarray(interpolation.points(states)), jnp.asarray(interpolation.points(actions))
+    )
+
+    def with_absorbing(leaf: jax.Array, value: float) -> jax.Array:
+        return jnp.concatenate([leaf, jnp.full_like(leaf[:1], value)])
+
+    share = 1.0 / weight.shape[-1]
+    return FiniteMDP(
+        SparseDynamics(with_absorbing(index, states.size), with_absorbing(weight, share)),
+        with_absorbing(reward, 0.0),
+        jnp.arange(states.size + 1) == states.size,
+        states,
+        actions,
+    )
+
+
+def look_up(mdp: FiniteMDP, table: jax.Array, observation: jax.Array) -> jax.Array:
+    """Interpolate a table of the states, `[S, ...]`, at observations `[..., O]`."""
+    index, weight = interpolation.interpolate(mdp.states, observation)
+    rows = table[index]
+    return jnp.sum(
+        rows * weight.reshape(weight.shape + (1,) * (table.ndim - 1)), axis=weight.ndim - 1
+    )
+
+
+def greedy(mdp: FiniteMDP, action_values: jax.Array) -> Callable[[jax.Array], jax.Array]:
+    """The policy that takes the best action of the grid: `[..., O]` -> `[..., A]`.
+
+    Args:
+        mdp: whose grids.
+        action_values: Q `[S, A]` (or any other preference).
+    """
+    actions = jnp.asarray(interpolation.points(mdp.actions))
+
+    def act(observation: jax.Array) -> jax.Array:
+        return actions[jnp.argmax(look_up(mdp, action_values, observation), axis=-1)]
+
+    return act
+
+
+def sampled(mdp: FiniteMDP, env: Env) -> Env:
+    """`env` with log-probabilities over the grid's actions for actions, drawn by the step's key.
+
+    It makes a stochastic policy out of one that only reads observations, so that
+    `evaluation.rollout` can run it: `lambda o: look_up(mdp, policy.log_probabilities, o)`.
+    """
+    actions = jnp.asarray(interpolation.points(mdp.actions))
+
+    def step(key: jax.Array, state: Any, action: jax.Array, params: Any) -> tuple[Any, Step]:
+        draw_key, step_key = jax.random.split(key)
+        drawn = actions[jax.random.categorical(draw_key, action)]
+        return env.step(step_key, state, drawn, params)
+
+    return env._replace(step=step)
+
+
+def _over(low: np.ndarray, high: np.ndarray, shape: Sequence[int]) -> Grid:
+    return Grid(tuple(map(float, low)), tuple(map(float, high)), tuple(shape))

@@ -1,0 +1,58 @@
+"""Transition probabilities of a finite Markov decision process, dense or sparse."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from cmedirl_jax.types import Array
+
+
+class SparseDynamics(NamedTuple):
+    """At most `K` successors of each state and action; the same one may be listed more than once.
+
+    Attributes:
+        next_state: `[S, A, K]` int32.
+        probability: `[S, A, K]`, summing to one over `K`.
+    """
+
+    next_state: Array
+    probability: Array
+
+
+Dynamics = Array | SparseDynamics
+"""P(s' | s, a): dense `[S, A, S]`, or sparse."""
+
+
+def expected_next(dynamics: Dynamics, values: jax.Array) -> jax.Array:
+    """sum_s' P(s'|s,a) V(s'): `[S]` -> `[S, A]`."""
+    if isinstance(dynamics, SparseDynamics):
+        return jnp.sum(dynamics.probability * values[dynamics.next_state], axis=-1)
+    return jnp.asarray(dynamics) @ values
+
+
+def next_distribution(dynamics: Dynamics, visits: jax.Array) -> jax.Array:
+    """sum_{s,a} mu(s,a) P(s'|s,a): `[S, A]` -> `[S]`, the transpose of `expected_next`."""
+    if isinstance(dynamics, SparseDynamics):
+        arriving = dynamics.probability * visits[..., None]
+        return jnp.zeros(visits.shape[0], arriving.dtype).at[dynamics.next_state].add(arriving)
+    return jnp.einsum("sa,sat->t", visits, dynamics)
+
+
+def check(dynamics: Dynamics, state_actions: tuple[int, ...]) -> None:
+    """Refuse dynamics that are not of `state_actions`, (S, A).
+
+    Raises:
+        ValueError: with both shapes.
+    """
+    if isinstance(dynamics, SparseDynamics):
+        shapes = (jnp.shape(dynamics.next_state), jnp.shape(dynamics.probability))
+        fits = shapes[0] == shapes[1] and len(shapes[0]) == 3 and shapes[0][:2] == state_actions
+    else:
+        shapes = jnp.shape(dynamics)
+        fits = shapes == (*state_actions, *state_actions[:1])
+    if len(state_actions) != 2 or not fits:
+        raise ValueError(
+            f"expected a reward [S, A] and dynamics [S, A, S] or two arrays [S, A, K], "
+            f"got {state_actions} and {shapes}"
+        )

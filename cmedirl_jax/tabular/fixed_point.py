@@ -1,0 +1,64 @@
+"""Fixed points of contractions, differentiable by the implicit function theorem."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from cmedirl_jax.types import Numeric
+
+
+class Stop(NamedTuple):
+    """When an iteration ends.
+
+    Attributes:
+        tolerance: greatest change of any entry at the last iteration, relative to the greatest
+            entry (or to 1, if that is less). What is left to go is at most
+            discount / (1 - discount) times that.
+        iterations: at most so many.
+    """
+
+    tolerance: Numeric = 1e-6
+    iterations: Numeric = 10_000
+
+
+def iterate(
+    function: Callable[[jax.Array], jax.Array], guess: jax.Array, stop: Stop
+) -> tuple[jax.Array, jax.Array]:
+    """Apply `function` until it changes nothing more: the point, and the last (relative) change."""
+
+    def going(carry):
+        _, change, count = carry
+        return (change > stop.tolerance) & (count < stop.iterations)
+
+    def advance(carry):
+        before, _, count = carry
+        after = function(before)
+        change = jnp.max(jnp.abs(after - before)) / jnp.maximum(1.0, jnp.max(jnp.abs(after)))
+        return after, change, count + 1
+
+    start = (guess, jnp.full((), jnp.inf, guess.dtype), jnp.zeros((), jnp.int32))
+    point, change, _ = jax.lax.while_loop(going, advance, start)
+    return point, change
+
+
+def solve(
+    function: Callable[[jax.Array], jax.Array], guess: jax.Array, stop: Stop
+) -> tuple[jax.Array, jax.Array]:
+    """Like `iterate`, with derivatives of the point by whatever `function` closes over."""
+
+    def tangent(linear: Callable[[jax.Array], jax.Array], value: jax.Array) -> jax.Array:
+        # `linear` is I - dF: its inverse is the fixed point of x -> value + dF x.
+        def invert(matvec: Callable[[jax.Array], jax.Array], value: jax.Array) -> jax.Array:
+            return iterate(lambda x: value + x - matvec(x), value, stop)[0]
+
+        return jax.lax.custom_linear_solve(linear, value, invert, transpose_solve=invert)
+
+    return jax.lax.custom_root(
+        lambda x: x - function(x),
+        guess,
+        lambda _, guess: iterate(function, guess, stop),
+        tangent,
+        has_aux=True,
+    )

@@ -1,0 +1,80 @@
+"""Regular grids over a box, with multilinear interpolation between their points."""
+
+import dataclasses
+import itertools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax.types import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """Evenly spaced points, the box's bounds included. Static: it may be closed over or hashed.
+
+    Attributes:
+        low: lower bound of each of the `D` dimensions.
+        high: upper bounds.
+        shape: points along each dimension, at least two.
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    shape: tuple[int, ...]
+
+    def __post_init__(self):
+        if not len(self.low) == len(self.high) == len(self.shape):
+            raise ValueError(
+                f"a grid needs as many bounds as sizes, got {self.low}, {self.high}, {self.shape}"
+            )
+        if min(self.shape, default=0) < 2:
+            raise ValueError(f"a grid needs two points along each dimension, got {self.shape}")
+        if not np.isfinite([*self.low, *self.high]).all():
+            raise ValueError(f"a grid needs finite bounds, got {self.low} and {self.high}")
+
+    @property
+    def size(self) -> int:
+        """Points in all."""
+        return math.prod(self.shape)
+
+    @property
+    def spacing(self) -> np.ndarray:
+        """Distance of neighbours along each dimension, `[D]`."""
+        return (np.array(self.high) - self.low) / (np.array(self.shape) - 1)
+
+
+def points(grid: Grid) -> np.ndarray:
+    """All points, `[size, D]` float32, the last dimension fastest."""
+    axes = [
+        np.linspace(*bounds, dtype=np.float32)
+        for bounds in zip(grid.low, grid.high, grid.shape, strict=True)
+    ]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
+def interpolate(grid: Grid, position: Array) -> tuple[jax.Array, jax.Array]:
+    """Neighbouring points and their weights; positions outside the box count as on its border.
+
+    Args:
+        grid: of `D` dimensions.
+        position: `[..., D]`.
+
+    Returns:
+        Indices into `points(grid)` `[..., 2^D]` int32, and weights that sum to one.
+    """
+    shape = np.array(grid.shape)
+    steps = (jnp.asarray(position) - np.array(grid.low, np.float32)) / grid.spacing.astype(
+        np.float32
+    )
+    steps = jnp.clip(steps, 0.0, (shape - 1).astype(np.float32))
+    below = jnp.minimum(steps.astype(jnp.int32), shape - 2)
+    fraction = steps - below
+    corners = np.array(list(itertools.product((0, 1), repeat=len(shape))))  # [2^D, D]
+    index = jnp.ravel_multi_index(
+        tuple(jnp.moveaxis(below[..., None, :] + corners, -1, 0)), grid.shape, mode="clip"
+    )
+    weight = jnp.where(corners, fraction[..., None, :], 1.0 - fraction[..., None, :])
+    return index.astype(jnp.int32), jnp.prod(weight, axis=-1)

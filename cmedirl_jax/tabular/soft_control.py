@@ -1,0 +1,145 @@
+"""Maximum-entropy control of a finite Markov decision process, with a model (Eqs. 7 and 8).
+
+    policy = soft_value_iteration(dynamics, reward, discount=0.99)
+    visits = expected_visitation(dynamics, policy, initial, discount=0.99)
+
+Soft, not hard: V(s) = alpha log sum_a exp(Q(s, a) / alpha). With alpha = 1, deterministic dynamics
+and starts equal to the demonstrations', the derivative of the demonstrations' (discounted) causal
+log-likelihood by the reward is mu_D - E[mu] exactly; hard value iteration does not have that.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from cmedirl_jax.tabular import dynamics as dynamics_lib
+from cmedirl_jax.tabular import fixed_point
+from cmedirl_jax.tabular.dynamics import Dynamics
+from cmedirl_jax.tabular.fixed_point import Stop
+from cmedirl_jax.types import Array, Numeric
+
+
+class SoftPolicy(NamedTuple):
+    """The soft-optimal policy. Without the axis `T` for an infinite horizon.
+
+    Attributes:
+        log_probabilities: `[T, S, A]`, log pi_t(a|s) = (Q_t(s, a) - V_t(s)) / alpha.
+        action_values: `[T, S, A]`, Q_t(s, a) = r(s, a) + gamma sum_s' P(s'|s,a) V_{t+1}(s').
+        values: `[T, S]`, V_t(s) = alpha log sum_a exp(Q_t(s, a) / alpha); 0 where absorbing.
+        residual: `[]`, relative change at the last iteration; 0 for a finite horizon. Above the
+            tolerance only where the bound on iterations was met.
+    """
+
+    log_probabilities: jax.Array
+    action_values: jax.Array
+    values: jax.Array
+    residual: jax.Array
+
+
+def soft_value_iteration(
+    dynamics: Dynamics,
+    reward: jax.Array,
+    *,
+    discount: Numeric,
+    horizon: int | None = None,
+    temperature: Numeric = 1.0,
+    absorbing: Array | None = None,
+    stop: Stop | None = None,
+    guess: jax.Array | None = None,
+) -> SoftPolicy:
+    """Solve for the soft-optimal policy. Differentiable by the reward, also at the fixed point.
+
+    Args:
+        dynamics: P(s'|s,a).
+        reward: `[S, A]`.
+        discount: gamma; below 1 for an infinite horizon.
+        horizon: steps T of an episode, with V_T = 0; None for the fixed point.
+        temperature: alpha, above 0.
+        absorbing: `[S]` bool, where the episode is over: no reward, no action, no entropy.
+        stop: of the fixed point's iteration.
+        guess: `[S]`, where that begins; default zeros.
+
+    Raises:
+        ValueError: if the shapes do not fit each other.
+    """
+    dynamics_lib.check(dynamics, reward.shape)
+
+    def back_up(values: jax.Array) -> tuple[jax.Array, jax.Array]:
+        q = reward + discount * dynamics_lib.expected_next(dynamics, values)
+        v = temperature * jax.nn.logsumexp(q / temperature, axis=-1)
+        return v if absorbing is None else jnp.where(absorbing, 0.0, v), q
+
+    residual = jnp.zeros((), reward.dtype)
+    if horizon is None:
+        guess = jnp.zeros_like(reward[:, 0]) if guess is None else guess
+        values, residual = fixed_point.solve(lambda v: back_up(v)[0], guess, stop or Stop())
+        values, q = back_up(values)
+    else:
+
+        def body(values: jax.Array, _: None):
+            values, q = back_up(values)
+            return values, (values, q)
+
+        last = jnp.zeros_like(reward[:, 0])
+        _, (values, q) = jax.lax.scan(body, last, None, length=horizon, reverse=True)
+    return SoftPolicy(jax.nn.log_softmax(q / temperature, axis=-1), q, values, residual)
+
+
+def expected_visitation(
+    dynamics: Dynamics,
+    policy: SoftPolicy,
+    initial: jax.Array,
+    *,
+    discount: Numeric,
+    horizon: int | None = None,
+    absorbing: Array | None = None,
+    stop: Stop | None = None,
+    guess: jax.Array | None = None,
+) -> jax.Array:
+    """E[mu](s, a) = sum_t gamma^t D_t(s) pi_t(a|s), `[S, A]` (Eq. 7, by dynamic programming).
+
+    D_{t+1}(s') = sum_{s,a} D_t(s) pi_t(a|s) P(s'|s,a). Nothing is visited once absorbed.
+
+    Args:
+        dynamics: P(s'|s,a).
+        policy: as `soft_value_iteration` gave it for the same horizon.
+        initial: `[S]`, the distribution of the first state.
+        discount: gamma.
+        horizon: steps T; None to sum until nothing is added any more.
+        absorbing: `[S]` bool.
+        stop: of the sum without a horizon.
+        guess: `[S]`, the discounted number of visits where its iteration begins.
+
+    Raises:
+        ValueError: if the policy is not of that horizon, or the shapes do not fit each other.
+    """
+    steps = () if horizon is None else (horizon,)
+    if policy.log_probabilities.shape != (*steps, *policy.log_probabilities.shape[-2:]):
+        raise ValueError(
+            f"a policy of horizon {horizon} has log_probabilities {(*steps, 'S', 'A')}, "
+            f"got {policy.log_probabilities.shape}"
+        )
+    dynamics_lib.check(dynamics, policy.log_probabilities.shape[-2:])
+    probabilities = jnp.exp(policy.log_probabilities)
+    if absorbing is not None:
+        probabilities = jnp.where(jnp.asarray(absorbing)[:, None], 0.0, probabilities)
+    if horizon is None:
+
+        def extend(visits: jax.Array) -> jax.Array:
+            moved = dynamics_lib.next_distribution(dynamics, visits[:, None] * probabilities)
+            return initial + discount * moved
+
+        guess = initial if guess is None else guess
+        visits, _ = fixed_point.solve(extend, guess, stop or Stop())
+        return visits[:, None] * probabilities
+
+    def body(carry, probabilities: jax.Array):
+        distribution, weight, total = carry
+        visits = distribution[:, None] * probabilities
+        moved = dynamics_lib.next_distribution(dynamics, visits)
+        return (moved, weight * discount, total + weight * visits), None
+
+    carry = (initial, jnp.ones_like(initial[0]), jnp.zeros_like(probabilities[0]))
+    (_, _, total), _ = jax.lax.scan(body, carry, probabilities)
+    return total
