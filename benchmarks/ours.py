@@ -30,8 +30,10 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         ),
         # The hot start is over before anything is timed; it need not be a good one.
         hot_start=HotStartHParams(steps=20),
-        # At once: a call that only collected would look fast.
-        schedule=Schedule(batch_size=workload.batch, learning_starts=0),
+        # At once, for a call that only collected would look fast; the cloning never fades either.
+        schedule=Schedule(
+            batch_size=workload.batch, learning_starts=0, behaviour_cloning_steps=10**9
+        ),
     )
     devices = jax.devices()[: workload.devices]
     group = workload.group or seeds.group_size(workload.seeds, len(devices), workload.hidden)

@@ -8,7 +8,7 @@ import dataclasses
 import itertools
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,9 +20,8 @@ from rich.table import Table
 from benchmarks import measuring, plots
 from benchmarks.measuring import Comparison
 from benchmarks.workload import Workload
-from cmedirl_jax.methods import METHODS
+from cmedirl_jax.methods import PAPER_METHODS
 
-METHOD_NAMES = tuple(METHODS)
 SEEDS = (1, 8, 32, 100, 1000)
 WIDTHS = ((64, 64), (128, 128), (400, 300))
 
@@ -36,6 +35,8 @@ class Options:
     suites: tuple[str, ...] = ()
     """Only these parts of the whole: seeds, width, batch, method, scale, devices, ended,
     demonstrations, group, compilation."""
+    methods: tuple[str, ...] = PAPER_METHODS
+    """Only these methods."""
     devices: int | None = None
     """Devices of the workloads that use several; default: every core, or every GPU."""
     rounds: int | None = None
@@ -52,7 +53,7 @@ class Suite(NamedTuple):
     ratios: list[tuple[str, int, int]]
 
 
-def suites(devices: int, quick: bool) -> Iterator[Suite]:
+def suites(devices: int, methods: Sequence[str], quick: bool) -> Iterator[Suite]:
     """All there is to measure, in parts."""
     ours, naive = Workload(), Workload("naive")
     everywhere = dataclasses.replace(ours, devices=devices)
@@ -61,7 +62,7 @@ def suites(devices: int, quick: bool) -> Iterator[Suite]:
         ratios = [("ours / naive", 0, 1), (f"{devices} devices / 1", 2, 0)]
         yield Suite("quick", workloads, ratios[: len(workloads) - 1])
         return
-    for method, seeds in itertools.product(METHOD_NAMES, SEEDS):
+    for method, seeds in itertools.product(methods, SEEDS):
         pair = [Workload(variant, method, seeds) for variant in ("ours", "naive")]
         yield Suite("seeds", pair, [(f"ours / naive, {method}, {seeds} seeds", 0, 1)])
     for hidden, layer_norm in itertools.product(WIDTHS, (False, True)):
@@ -72,17 +73,18 @@ def suites(devices: int, quick: bool) -> Iterator[Suite]:
         yield Suite("width", pair, [(name, 0, 1)])
     pair = [Workload(variant, batch=128) for variant in ("ours", "naive")]
     yield Suite("batch", pair, [("ours / naive, batch 128", 0, 1)])
+    beside = [method for method in methods if method != "ddpg"]
     yield Suite(
         "method",
-        [Workload(method=method) for method in METHOD_NAMES] + [Workload(layer_norm=True)],
+        [ours, *(Workload(method=name) for name in beside), Workload(layer_norm=True)],
         [
-            *((f"cost of {name} / ddpg", 0, i) for i, name in enumerate(METHOD_NAMES[1:], start=1)),
-            ("cost of layer norm / none", 0, 4),
+            *((f"cost of {name} / ddpg", 0, i) for i, name in enumerate(beside, start=1)),
+            ("cost of layer norm / none", 0, len(beside) + 1),
         ],
     )
     yield Suite("scale", [ours, Workload(seeds=1000)], [("1,000 seeds / 100 seeds", 1, 0)])
     if devices > 1:
-        for method in METHOD_NAMES:
+        for method in methods:
             one = Workload(method=method)
             pair = [dataclasses.replace(one, devices=devices), one]
             yield Suite("devices", pair, [(f"{devices} devices / 1, {method}", 0, 1)])
@@ -101,11 +103,11 @@ def suites(devices: int, quick: bool) -> Iterator[Suite]:
         yield Suite("group", groups, ratios[1:])
 
 
-def compilation_times() -> list[dict[str, Any]]:
+def compilation_times(methods: Sequence[str]) -> list[dict[str, Any]]:
     """What compiling each method costs with an empty cache, and with one that holds it."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
-        for method, cache in itertools.product(METHOD_NAMES, ("cold", "warm")):
+        for method, cache in itertools.product(methods, ("cold", "warm")):
             workload = Workload(method=method, devices=measuring.cores())
             worker = measuring.start(workload, 250, JAX_COMPILATION_CACHE_DIR=folder)
             seconds = worker.facts["compile_seconds"]
@@ -119,13 +121,19 @@ def main(options: Options) -> int:
     console = Console(width=None if sys.stdout.isatty() else 120)
     devices = options.devices or measuring.cores()
     rounds = options.rounds or (3 if options.quick else 5)
-    everything = list(suites(devices, options.quick))
+    everything = list(suites(devices, options.methods, options.quick))
     names = list(dict.fromkeys([suite.name for suite in everything] + ["compilation"]))
-    for name in options.suites:
-        if name not in names:
-            message = f"--suites: unknown suite {name!r}; there are {', '.join(names)}"
-            print(f"seeds_per_second: {message}", file=sys.stderr)
-            return 2
+    for option, asked, known in (
+        ("suites", options.suites, names),
+        ("methods", options.methods, PAPER_METHODS),
+    ):
+        for name in asked:
+            if name not in known:
+                message = (
+                    f"--{option}: unknown {option[:-1]} {name!r}; there are {', '.join(known)}"
+                )
+                print(f"seeds_per_second: {message}", file=sys.stderr)
+                return 2
     result: dict[str, Any] = {
         **measuring.heading("seeds_per_second"),
         "records": [],
@@ -144,7 +152,7 @@ def main(options: Options) -> int:
         # After each suite: the whole takes most of an hour, and none of it should be lost.
         write(result, options.json)
     if "compilation" in (options.suites or ("compilation",)) and not options.quick:
-        result["compilation"] = compilation_times()
+        result["compilation"] = compilation_times(options.methods)
         write(result, options.json)
     console.print(table(result["records"]))
     return 0

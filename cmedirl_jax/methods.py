@@ -52,6 +52,10 @@ METHODS: dict[str, Method] = {
 }
 
 
+PAPER_METHODS = ("ddpg", "hs-ddpg", "me-ddpg", "hs-me-ddpg")
+"""The four that the paper names."""
+
+
 @dataclasses.dataclass(frozen=True)
 class ExplorationSettings:
     """The behaviour policy."""

@@ -9,7 +9,7 @@ import tyro
 from cmedirl_jax.ddpg import DDPGHParams
 from cmedirl_jax.hot_start import HotStartHParams
 from cmedirl_jax.irl import IRLHParams
-from cmedirl_jax.methods import METHODS, ExplorationSettings, Settings
+from cmedirl_jax.methods import PAPER_METHODS, ExplorationSettings, Settings
 from cmedirl_jax.schedules import RewardSchedule, Schedule
 
 Expert = Literal["best", "median", "all"]
@@ -33,7 +33,7 @@ class Grid:
 
     preset: Literal["tuned", "paper", "smoke"] = "tuned"
     """tuned: the setting that works; paper: the paper's letter; smoke: ends within a minute."""
-    methods: tuple[str, ...] = tuple(METHODS)
+    methods: tuple[str, ...] = PAPER_METHODS
     """Which methods to train."""
     n_demos: tuple[int, ...] = (200,)
     """Demonstrated trajectories N_T per learner; several make Figures 4 and 5."""

@@ -15,6 +15,7 @@ from benchmarks.measuring import Record
 from benchmarks.peers import PEERS
 from benchmarks.serving import Worker
 from benchmarks.workload import Workload
+from cmedirl_jax.methods import PAPER_METHODS
 from experiments import cells
 from tests import pools
 
@@ -165,7 +166,7 @@ def test_seeds_per_second_writes_what_the_design_lists(fake_start, tmp_path, qui
     if quick:
         assert measured == {("ddpg", 100)}
     else:
-        methods, sizes = seeds_per_second.METHOD_NAMES, seeds_per_second.SEEDS
+        methods, sizes = PAPER_METHODS, seeds_per_second.SEEDS
         assert measured >= {(method, seeds) for method in methods for seeds in sizes}
         assert len(written["compilation"]) == 2 * len(methods)
 
@@ -177,9 +178,24 @@ def test_only_the_suites_asked_for_are_measured(fake_start, tmp_path):
     assert json.loads(path.read_text())["compilation"] == []
 
 
-def test_an_unknown_suite_is_refused(fake_start, capsys):
-    assert seeds_per_second.main(seeds_per_second.Options(suites=("sizes",))) == 2
-    assert capsys.readouterr().err.startswith("seeds_per_second: --suites: unknown suite 'sizes'")
+def test_only_the_methods_asked_for_are_measured(fake_start):
+    options = seeds_per_second.Options(suites=("seeds", "method"), methods=("me-ddpg",))
+    assert seeds_per_second.main(options) == 0
+    seeds_suite = [workload.method for workload, _ in fake_start[: 2 * len(seeds_per_second.SEEDS)]]
+    assert set(seeds_suite) == {"me-ddpg"}
+    assert [workload.method for workload, _ in fake_start[-3:]] == ["ddpg", "me-ddpg", "ddpg"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"suites": ("sizes",)}, "--suites: unknown suite 'sizes'; there are seeds, "),
+        ({"methods": ("sac",)}, "--methods: unknown method 'sac'; there are ddpg, "),
+    ],
+)
+def test_unknown_suites_and_methods_are_refused(fake_start, capsys, options, message):
+    assert seeds_per_second.main(seeds_per_second.Options(**options)) == 2
+    assert capsys.readouterr().err.startswith(f"seeds_per_second: {message}")
 
 
 def test_a_record_is_summed_up_by_its_median():
