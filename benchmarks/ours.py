@@ -41,7 +41,7 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         env,
         METHODS[workload.method],
         settings,
-        judging.make(env, settings.architecture, group, devices),
+        judging.of_networks(env, settings.architecture, group, devices),
         cells.compile_networks(env, settings.architecture, group, devices),
         group=group,
         seeds_count=workload.seeds,

@@ -1,4 +1,4 @@
-"""The paper's four methods, each one line: what it adds to DDPG, and the settings they share."""
+"""The methods, each one line of composition, and the settings they share."""
 
 import dataclasses
 from typing import Literal, NamedTuple
@@ -16,6 +16,8 @@ from cmedirl_jax.irl import IRLHParams, RewardLearner
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.replay import Replay
 from cmedirl_jax.schedules import RewardSchedule, Schedule
+from cmedirl_jax.tabular import frozen, imitation
+from cmedirl_jax.tabular.imitation import TabularSettings
 from cmedirl_jax.types import EnvSpec
 
 
@@ -28,17 +30,23 @@ class Method(NamedTuple):
         hot_start: whether actor and critic start from the demonstrations (Eq. 11). With
             `schedule.behaviour_cloning_steps` the actor also goes on imitating them for a while.
         learned_reward: whether r_D is learned (Algorithm 1) and added to r_e (Eq. 10).
+        tabular_reward: maximum-entropy IRL by dynamic programming on a grid of the environment
+            (Eqs. 6-9), with a "linear" or a "deep" reward, or None. That reward is r_D, frozen.
+        interacts: whether DDPG learns in the environment; if not, the method's policy is the
+            soft-optimal one of the tabular reward.
     """
 
     name: str
     description: str
     hot_start: bool = False
     learned_reward: bool = False
+    tabular_reward: imitation.Kind | None = None
+    interacts: bool = True
 
     @property
     def uses_demonstrations(self) -> bool:
         """Whether the method reads demonstrations at all."""
-        return self.hot_start or self.learned_reward
+        return self.hot_start or self.learned_reward or self.tabular_reward is not None
 
 
 METHODS: dict[str, Method] = {
@@ -48,6 +56,21 @@ METHODS: dict[str, Method] = {
         Method("hs-ddpg", "DDPG hot-started, then cloning that fades", hot_start=True),
         Method("me-ddpg", "DDPG on r_D + r_e", learned_reward=True),
         Method("hs-me-ddpg", "both (Algorithm 2)", hot_start=True, learned_reward=True),
+        Method(
+            "tabular-me-ddpg", "DDPG on r_D + r_e, r_D of deep-maxent-irl", tabular_reward="deep"
+        ),
+        Method(
+            "maxent-irl",
+            "maximum-entropy IRL with a model, theta^T phi",
+            tabular_reward="linear",
+            interacts=False,
+        ),
+        Method(
+            "deep-maxent-irl",
+            "the same with a network",
+            tabular_reward="deep",
+            interacts=False,
+        ),
     )
 }
 
@@ -78,6 +101,7 @@ class Settings:
     reward_schedule: RewardSchedule = RewardSchedule()
     hot_start: HotStartHParams = HotStartHParams()
     schedule: Schedule = Schedule()
+    tabular: TabularSettings = TabularSettings()
 
 
 class Algorithm(NamedTuple):
@@ -98,12 +122,15 @@ class Algorithm(NamedTuple):
 
 def compose(spec: EnvSpec, method: Method, settings: Settings, capacity: int) -> Algorithm:
     """Make a method's parts; `capacity` is the replay's where the settings leave it open."""
-    learner = irl.make(
-        spec, settings.reward, network=rewards.mlp(spec, settings.reward_schedule.hidden)
-    )
+    learner = None
+    if method.tabular_reward is not None:
+        learner = frozen.make(*imitation.grids(spec, settings.tabular), settings.reward)
+    elif method.learned_reward:
+        network = rewards.mlp(spec, settings.reward_schedule.hidden)
+        learner = irl.make(spec, settings.reward, network=network)
     return Algorithm(
         agent=ddpg.make(spec, settings.agent, networks=networks.make(spec, settings.architecture)),
-        learner=learner if method.learned_reward else None,
+        learner=learner,
         exploration=make_exploration(spec, settings.exploration),
         replay=replay.make(spec, settings.schedule.replay_capacity or capacity),
     )

@@ -14,8 +14,8 @@ import numpy as np
 
 State = TypeVar("State")
 
-GROUP_SIZES = range(4, 11)
-"""Seeds per group whose states fit a core's cache at a width of 64; 5 and 10 were as fast."""
+GROUP_SIZES = ((range(4, 11), 128), (range(2, 3), 256))
+"""Seeds per group whose states fit a core's cache, for networks narrower than so many units."""
 
 
 def keys(key: jax.Array, count: int) -> jax.Array:
@@ -24,7 +24,7 @@ def keys(key: jax.Array, count: int) -> jax.Array:
 
 
 def group_size(seeds: int, devices: int = 1, hidden: Sequence[int] = (64, 64)) -> int:
-    """How many seeds to vmap together, for the least padding; 1 for networks too wide to share.
+    """How many seeds to vmap together, for the least padding; 1 for networks of 256 units or more.
 
     Args:
         seeds: how many seeds there are.
@@ -32,11 +32,12 @@ def group_size(seeds: int, devices: int = 1, hidden: Sequence[int] = (64, 64)) -
         hidden: units of each hidden layer.
     """
     per_device = -(-seeds // devices)
-    if max(hidden, default=0) >= 128:
-        return 1
-    if per_device < GROUP_SIZES.start:
-        return per_device
-    return min(GROUP_SIZES, key=lambda size: (-(-per_device // size) * size, -size))
+    for sizes, width in GROUP_SIZES:
+        if max(hidden, default=0) < width:
+            if per_device < sizes.start:
+                return per_device
+            return min(sizes, key=lambda size: (-(-per_device // size) * size, -size))
+    return 1
 
 
 def padded(seeds: int, group: int, devices: int = 1) -> int:

@@ -26,6 +26,7 @@ from cmedirl_jax.irl import RewardState
 from cmedirl_jax.methods import Algorithm, Method, Settings
 from cmedirl_jax.replay import ReplayState
 from cmedirl_jax.schedules import Plan
+from cmedirl_jax.tabular import frozen, imitation
 from cmedirl_jax.types import Numeric, Params, Transition
 from cmedirl_jax.updates import Draws
 
@@ -89,7 +90,8 @@ class Trainer(NamedTuple):
         algorithm: the method's parts.
         draw_networks: `key -> (actor, critic)`, the parameters that `init` starts from. They are
             the same for every method, so that one compiled program may draw them for all.
-        init: `(key, data, n_demonstrations, networks=None) -> TrainingState`, hot start included.
+        init: `(key, data, n_demonstrations, networks=None) -> TrainingState`, the hot start and the
+            fit of a tabular reward included.
             `data` is what `hot_start.data` made of the pool, or None for methods without
             demonstrations; `networks` is what `draw_networks` gave, where that was called apart.
         run: `(state, data, steps, max_episodes=None) -> (TrainingState, Log)` for `steps` `[T]`
@@ -134,7 +136,12 @@ def make(
         env_params: default `env.default_params`.
         subset_size: pad each seed's subset to this many demonstrations, so that their number may be
             traced: one program for every number of demonstrations.
+
+    Raises:
+        ValueError: for a method that does not act; `tabular.imitation` fits those.
     """
+    if not method.interacts:
+        raise ValueError(f"{method.name} does not act: there is nothing to train")
     settings = settings or Settings()
     env_params = env.default_params if env_params is None else env_params
     algorithm = methods.compose(env.spec, method, settings, capacity)
@@ -176,11 +183,24 @@ def make(
                 settings.hot_start,
                 subset=subset,
             )
+        reward = learner.init(reward_key) if learner else None
+        if method.tabular_reward is not None:
+            mdp = imitation.discretised(env, settings.tabular, params=env_params)
+            found = imitation.fit(
+                reward_key,
+                mdp,
+                env.spec,
+                data,  # type: ignore[arg-type]
+                subset,
+                kind=method.tabular_reward,
+                settings=settings.tabular,
+            )
+            reward = frozen.state(found.reward[:-1], settings.reward)
         env_state, observation = env.reset(env_key, env_params)
         return TrainingState(
             key=steps_key,
             agent=agent.init(agent_key, networks),
-            reward=learner.init(reward_key) if learner else None,
+            reward=reward,
             storage=replay.init().storage,
             exploration=exploration.init(noise_key),
             env=env_state,

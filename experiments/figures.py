@@ -17,7 +17,15 @@ from experiments import statistics
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#000000")
-LABELS = {"ddpg": "DDPG", "hs-ddpg": "HS-DDPG", "me-ddpg": "ME-DDPG", "hs-me-ddpg": "HS-ME-DDPG"}
+LABELS = {
+    "ddpg": "DDPG",
+    "hs-ddpg": "HS-DDPG",
+    "me-ddpg": "ME-DDPG",
+    "hs-me-ddpg": "HS-ME-DDPG",
+    "tabular-me-ddpg": "tabular ME-DDPG",
+    "maxent-irl": "MaxEnt IRL",
+    "deep-maxent-irl": "deep MaxEnt IRL",
+}
 
 
 def draw(
@@ -132,6 +140,8 @@ def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None
             rows[column + end].cast(pl.Float64).to_numpy() for end in ("_low", "", "_high")
         )
         label = LABELS.get(method, method)
+        if np.isnan(middle).all():
+            continue
         if rows["n_demos"].max() == 0:
             axes.axhline(middle[0], color=colour, label=label)
             if not np.isnan(high[0]):
@@ -163,7 +173,12 @@ def _band(axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, colour: s
     intervals = np.array([statistics.mean(values.to_numpy()) for values in points[y]])
     if not len(intervals):
         return
-    axes.plot(points[x], intervals[:, 0], color=colour, label=LABELS.get(method, method))
+    label = LABELS.get(method, method)
+    if len(intervals) == 1:
+        # Of a method that never interacts: the same at every step.
+        axes.axhline(intervals[0, 0], color=colour, linestyle="-.", label=label)
+        return
+    axes.plot(points[x], intervals[:, 0], color=colour, label=label)
     axes.fill_between(
         points[x], intervals[:, 1], intervals[:, 2], color=colour, alpha=0.2, linewidth=0
     )

@@ -25,6 +25,7 @@ from experiments import (
     results,
     statistics,
     tables,
+    tabular_cells,
 )
 from experiments.bookkeeping import Budget
 from experiments.cells import Programs
@@ -89,8 +90,18 @@ def _train_cells(
     pool = given if given is not None else _reusable(pool_path, env)
     trains_experts = needs_pool and pool is None
     expert_steps = grid.experts.seeds * grid.experts.steps
-    total = len(todo) * grid.seeds * budget.max_steps + expert_steps * trains_experts
+    learners = grid.seeds * sum(cell.method.interacts for cell in todo)
+    total = learners * budget.max_steps + expert_steps * trains_experts
     compile_method = _compiler(grid, env, devices, budget)
+    compile_tabular = functools.cache(
+        functools.partial(
+            tabular_cells.compile_method,
+            env,
+            settings=grid.settings,
+            devices=devices,
+            subset_size=max(grid.n_demos),
+        )
+    )
     with reporter(console, len(todo) + trains_experts, total) as report:
         if trains_experts:
             report.start(f"experts, {grid.experts.seeds} seeds")
@@ -112,17 +123,29 @@ def _train_cells(
             demonstrations.save(pool_path, pool)
         for cell in todo:
             report.start(f"{cell.name}, {grid.seeds} seeds")
-            programs = compile_method(cell.method, grid.settings)
-            result = cells.train(
-                programs,
-                keys.learners,
-                data if cell.n_demos else None,
-                cell.n_demos,
-                seeds_count=grid.seeds,
-                budget=budget,
-                threshold=env.spec.reward_threshold,
-                report=_stepwise(report, grid.seeds),
-            )
+            if cell.method.interacts:
+                programs = compile_method(cell.method, grid.settings)
+                result = cells.train(
+                    programs,
+                    keys.learners,
+                    data if cell.n_demos else None,
+                    cell.n_demos,
+                    seeds_count=grid.seeds,
+                    budget=budget,
+                    threshold=env.spec.reward_threshold,
+                    report=_stepwise(report, grid.seeds),
+                )
+            else:
+                programs = compile_tabular(cell.method)
+                assert data is not None
+                result = tabular_cells.train(
+                    programs,
+                    keys.learners,
+                    data,
+                    cell.n_demos,
+                    seeds_count=grid.seeds,
+                    evaluation_starts=grid.evaluation_starts,
+                )
             fresh = programs.judge.on_fresh_starts(result.best, keys.fresh_starts, FRESH_STARTS)
             rows = tables.rows(
                 result,
@@ -155,7 +178,7 @@ def _compiler(
 
     @functools.cache
     def judge(architecture: Architecture) -> Judge:
-        return judging.make(env, architecture, group(architecture), devices)
+        return judging.of_networks(env, architecture, group(architecture), devices)
 
     @functools.cache
     def draw_networks(architecture: Architecture) -> Callable:

@@ -15,7 +15,7 @@ from cmedirl_jax.networks import Architecture
 
 
 class Judge(NamedTuple):
-    """Compiled functions of actor parameters `[seeds, ...]`, any number of seeds.
+    """Compiled functions of policies' parameters `[seeds, ...]`, any number of seeds.
 
     Attributes:
         on_starts: `(actors, count, groups=None) -> Rollouts` `[seeds, count]`, from the fixed start
@@ -30,13 +30,22 @@ class Judge(NamedTuple):
     act: Callable[[Any, jax.Array], jax.Array]
 
 
-def make(env: Env, architecture: Architecture, group: int, devices: list[jax.Device]) -> Judge:
-    """A judge of policies of one architecture, in groups of `group` seeds on each device."""
-    actor_critic = networks.make(env.spec, architecture)
-    params = env.default_params
+def of_networks(
+    env: Env, architecture: Architecture, group: int, devices: list[jax.Device]
+) -> Judge:
+    """A judge of actors of one architecture."""
+    act = functools.partial(networks.policy, networks.make(env.spec, architecture))
+    return make(env, act, group, devices)
 
-    def act(actor: Any, observation: jax.Array) -> jax.Array:
-        return networks.policy(actor_critic, actor, observation)
+
+def make(
+    env: Env,
+    act: Callable[[Any, jax.Array], jax.Array],
+    group: int,
+    devices: list[jax.Device],
+) -> Judge:
+    """A judge of the policies `act(actor, observation)`, in groups of `group` on each device."""
+    params = env.default_params
 
     def on_starts(actors: Any, count: int, groups: int | None = None) -> Rollouts:
         return spread(actors, env.starts(count, params), groups)

@@ -2,10 +2,13 @@
 
 from typing import Any, NamedTuple
 
-from cmedirl_jax import demonstrations, envs, networks
+import jax
+
+from cmedirl_jax import demonstrations, envs, networks, rewards
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.methods import METHODS, Method
+from cmedirl_jax.tabular import imitation
 from experiments.bookkeeping import Budget
 from experiments.errors import UserError
 from experiments.presets import Grid
@@ -75,6 +78,12 @@ def check(grid: Grid) -> None:
         networks.make(env.spec, grid.settings.architecture)
     except ValueError as error:
         raise UserError(f"--architecture: {error}") from error
+    if any(METHODS[name].tabular_reward for name in grid.methods):
+        try:
+            jax.eval_shape(lambda: imitation.discretised(env, grid.settings.tabular))
+            rewards.radial_basis(env.spec, grid.settings.tabular.centres)
+        except ValueError as error:
+            raise UserError(f"--tabular: {error}") from error
     if grid.demos is None:
         check_enough(grid, grid.experts.trajectories)
 
@@ -116,6 +125,7 @@ def _positive(grid: Grid) -> list[tuple[str, float | None]]:
             ("period", "iterations", "anneal_steps", "batch_size", "recent"),
         ),
         ("hot_start", settings.hot_start, ("steps", "cells", "batch_size")),
+        ("tabular", settings.tabular, ("subsamples", "steps")),
         (
             "exploration.epsilon-greedy",
             settings.exploration.epsilon_greedy,
@@ -126,6 +136,7 @@ def _positive(grid: Grid) -> list[tuple[str, float | None]]:
         named += [(f"{prefix}.{name}", getattr(options, name)) for name in names]
     named += [("architecture.hidden", units) for units in settings.architecture.hidden]
     named += [("reward_schedule.hidden", units) for units in settings.reward_schedule.hidden]
+    named += [("tabular.hidden", units) for units in settings.tabular.hidden]
     return named
 
 

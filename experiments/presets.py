@@ -11,6 +11,7 @@ from cmedirl_jax.hot_start import HotStartHParams
 from cmedirl_jax.irl import IRLHParams
 from cmedirl_jax.methods import PAPER_METHODS, ExplorationSettings, Settings
 from cmedirl_jax.schedules import RewardSchedule, Schedule
+from cmedirl_jax.tabular.imitation import TabularSettings
 
 Expert = Literal["best", "median", "all"]
 
@@ -110,6 +111,8 @@ PRESETS: dict[str, Grid] = {
         seeds=8,
         max_steps=500,
         experts=ExpertSettings(seeds=8, steps=6_000, trajectories=64),
-        settings=Settings(hot_start=HotStartHParams(steps=200)),
+        settings=Settings(
+            hot_start=HotStartHParams(steps=200), tabular=TabularSettings(states=25, steps=30)
+        ),
     ),
 }

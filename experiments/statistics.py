@@ -7,6 +7,7 @@ evaluation that it misses. The intervals speak of the learners' seeds alone: all
 one pool of demonstrations, made by one set of experts.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -158,46 +159,47 @@ def summarise(
     ]
     columns = SeedStatistics(*(np.array(column, float) for column in zip(*found, strict=True)))
     converged = np.isfinite(columns.convergence_env_step)
+    # A method that never interacts has one evaluation, and nothing to converge by.
+    interacts = bool(seeds["env_steps"].sum())
     first = evaluations.row(0, named=True)
     dips = columns.dip_fraction[~np.isnan(columns.dip_fraction)]
     after = columns.return_after_convergence[converged]
     best = seeds["best_return"].to_numpy()
-    row: dict[str, Any] = {
-        **{name: first[name] for name in ("expert", "method", "n_demos")},
-        "seeds": len(found),
-        **_named("converged_fraction", share(converged)),
-        **_named("convergence_env_step_median", _from_zero(median(columns.convergence_env_step))),
-    }
+    soft = evaluations.filter(pl.col("protocol") == "soft")["return_mean"].to_numpy()
     # Under a budget of steps a failing seed lives fewer episodes than a succeeding one: statistics
     # over episodes then say something only if no seed failed.
     lived = seeds.filter(~pl.col("diverged"))["episodes"]
-    comparable = bool(converged.all()) or (
-        max_episodes is not None and bool((lived == max_episodes).all())
+    comparable = interacts and (
+        bool(converged.all()) or (max_episodes is not None and bool((lived == max_episodes).all()))
     )
     restricted = np.where(converged, columns.convergence_episode, float(max_episodes or 0))
-    row |= {
-        **(
-            _named("convergence_episode_median", _from_zero(median(columns.convergence_episode)))
-            if comparable
-            else _empty("convergence_episode_median")
+    row: dict[str, Any] = {
+        **{name: first[name] for name in ("expert", "method", "n_demos")},
+        "seeds": len(found),
+        **_interval("converged_fraction", lambda: share(converged), interacts),
+        **_interval(
+            "convergence_env_step_median",
+            lambda: _from_zero(median(columns.convergence_env_step)),
+            interacts,
+        ),
+        **_interval(
+            "convergence_episode_median",
+            lambda: _from_zero(median(columns.convergence_episode)),
+            comparable,
         ),
         "convergence_episode_mean": float(restricted.mean()) if comparable else None,
-        "convergence_episode_std": float(restricted.std(ddof=1))
-        if comparable and restricted.size > 1
-        else None,
-        "convergence_episode_restricted": not bool(converged.all()),
-        **_named("sustained_fraction", share(columns.sustained.astype(bool))),
-        **(_named("dip_fraction", mean(dips)) if dips.size else _empty("dip_fraction")),
-        **_named("area", mean(columns.area)),
+        "convergence_episode_std": _std(restricted) if comparable else None,
+        "convergence_episode_restricted": not bool(converged.all()) if interacts else None,
+        **_interval("sustained_fraction", lambda: share(columns.sustained.astype(bool)), interacts),
+        **_interval("dip_fraction", lambda: mean(dips), dips.size > 0),
+        **_interval("area", lambda: mean(columns.area)),
         "final_return_mean": float(columns.final_return.mean()),
         "final_return_std": _std(columns.final_return),
+        "soft_return_mean": float(soft.mean()) if soft.size else None,
+        "soft_return_std": _std(soft),
         "best_return_mean": float(best.mean()),
         "best_return_std": _std(best),
-        **(
-            _named("return_after_convergence", mean(after))
-            if after.size
-            else _empty("return_after_convergence")
-        ),
+        **_interval("return_after_convergence", lambda: mean(after), interacts and after.size > 0),
     }
     iqm = interquartile_mean(columns.final_return)
     row |= {"iqm": iqm.estimate, "iqm_low": iqm.low, "iqm_high": iqm.high}
@@ -217,13 +219,13 @@ def _from_zero(interval: Interval) -> Interval:
     return interval._replace(low=max(interval.low, 0.0))
 
 
-def _named(name: str, interval: Interval) -> dict[str, float | None]:
-    finite = [value if np.isfinite(value) else None for value in interval]
+def _interval(
+    name: str, of: Callable[[], Interval], there_is_one: bool = True
+) -> dict[str, float | None]:
+    """The three columns of an interval; empty where there is none, or a bound is infinite."""
+    values = of() if there_is_one else (np.inf,) * 3
+    finite = [value if np.isfinite(value) else None for value in values]
     return dict(zip((name, f"{name}_low", f"{name}_high"), finite, strict=True))
-
-
-def _empty(name: str) -> dict[str, None]:
-    return dict.fromkeys((name, f"{name}_low", f"{name}_high"))
 
 
 def _std(values: np.ndarray) -> float | None:

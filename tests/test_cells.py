@@ -60,7 +60,7 @@ def programs(env):
         short,
         METHODS["ddpg"],
         settings,
-        judging.make(short, settings.architecture, 2, devices),
+        judging.of_networks(short, settings.architecture, 2, devices),
         cells.compile_networks(short, settings.architecture, 2, devices),
         group=2,
         seeds_count=SEEDS,

@@ -16,7 +16,7 @@ def test_policies_return_in_gymnasium_what_they_return_in_jax(env, spec):
         "Dense_1": {"kernel": np.array([[5.0], [-5.0]]), "bias": np.array([0.01])},
     }
     actors = jax.tree.map(lambda *leaves: np.stack(leaves), actor, {"params": layers})
-    judge = judging.make(env, ARCHITECTURE, 2, jax.devices()[:1])
+    judge = judging.of_networks(env, ARCHITECTURE, 2, jax.devices()[:1])
 
     found = gymnasium_replay.replay(judge, actors, env)
 

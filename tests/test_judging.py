@@ -23,7 +23,7 @@ def nearby(env):
 
 @pytest.fixture(scope="module")
 def judge(nearby):
-    return judging.make(nearby, ARCHITECTURE, GROUP, jax.devices()[:1])
+    return judging.of_networks(nearby, ARCHITECTURE, GROUP, jax.devices()[:1])
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@ import dataclasses
 
 import pytest
 
-from cmedirl_jax import envs, methods
+from cmedirl_jax import envs, methods, training
 from cmedirl_jax.methods import METHODS, ExplorationSettings, Settings
 from cmedirl_jax.schedules import Schedule
 
@@ -10,21 +10,33 @@ SPEC = envs.make("MountainCarContinuous-v0").spec
 
 
 def test_the_papers_methods_are_the_four_combinations_of_its_two_parts():
-    parts = {name: (method.hot_start, method.learned_reward) for name, method in METHODS.items()}
+    paper = {name: METHODS[name] for name in methods.PAPER_METHODS}
+    parts = {name: (method.hot_start, method.learned_reward) for name, method in paper.items()}
     assert parts == {
         "ddpg": (False, False),
         "hs-ddpg": (True, False),
         "me-ddpg": (False, True),
         "hs-me-ddpg": (True, True),
     }
-    assert [m.uses_demonstrations for m in METHODS.values()] == [False, True, True, True]
+    assert [m.uses_demonstrations for m in paper.values()] == [False, True, True, True]
+    assert all(m.interacts and m.tabular_reward is None for m in paper.values())
+
+
+def test_methods_go_by_their_names():
     assert all(name == method.name for name, method in METHODS.items())
 
 
-@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
-def test_a_reward_is_learned_only_where_the_method_has_one(method):
-    algorithm = methods.compose(SPEC, method, Settings(), capacity=10)
-    assert (algorithm.learner is not None) == method.learned_reward
+@pytest.mark.parametrize("name", METHODS)
+def test_a_reward_is_made_only_where_the_method_has_one(name):
+    algorithm = methods.compose(SPEC, METHODS[name], Settings(), capacity=10)
+    assert (algorithm.learner is None) == (name in ("ddpg", "hs-ddpg"))
+
+
+@pytest.mark.parametrize("name", ["maxent-irl", "deep-maxent-irl"])
+def test_methods_that_do_not_act_are_not_trained(name, env):
+    assert METHODS[name].uses_demonstrations
+    with pytest.raises(ValueError, match=f"{name} does not act"):
+        training.make(env, METHODS[name], capacity=10)
 
 
 @pytest.mark.parametrize(("own", "capacity"), [(None, 10), (7, 7)])

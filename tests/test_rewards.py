@@ -43,3 +43,20 @@ def test_mlp_is_an_unnormalised_perceptron_of_both_inputs(spec):
         x = np.maximum(x @ np.float64(layer["kernel"]) + layer["bias"], 0)
     expected = (x @ np.float64(layers[-1]["kernel"]) + layers[-1]["bias"])[:, 0]
     np.testing.assert_allclose(network.apply(params, observation, action), expected, rtol=1e-4)
+
+
+def test_radial_basis_functions_share_one_and_vary_by_the_action(spec):
+    features = rewards.radial_basis(spec, 4)
+    observation = np.array([[-1.2, -0.07], [-0.3, 0.0], [0.6, 0.07]], np.float32)
+    action = np.array([[0.5], [-1.0], [0.0]], np.float32)
+    found = np.asarray(features(observation, action)).reshape(3, 16, 3)
+    of_action = np.hstack([np.ones((3, 1)), action, action**2])
+    np.testing.assert_allclose(found.sum(axis=1), of_action, rtol=1e-5)
+    # The centres run over the bounds, the last dimension fastest.
+    assert found[0, :, 0].argmax() == 0
+    assert found[2, :, 0].argmax() == 15
+    distance = np.array([[x, y] for x in range(4) for y in range(4)]) - 1.5
+    weight = np.exp(-0.5 * np.square(distance).sum(axis=1))
+    np.testing.assert_allclose(found[1, :, 0], weight / weight.sum(), rtol=1e-4)
+    with pytest.raises(ValueError, match="two centres or more, got 1"):
+        rewards.radial_basis(spec, 1)

@@ -66,6 +66,15 @@ def refused(main, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
+        (
+            "--methods maxent-irl --tabular.states 1",
+            "--tabular: a grid needs two points along each dimension, got (1, 1)",
+        ),
+        (
+            "--methods maxent-irl --tabular.centres 1",
+            "--tabular: radial basis functions need two centres or more, got 1",
+        ),
+        ("--tabular.steps 0", "--tabular.steps: must be at least 1, got 0"),
         ("--methods ddpg td3", f"--methods: unknown method 'td3'; there are {', '.join(METHODS)}"),
         ("--methods", "--methods: give one or more, each once"),
         ("--methods ddpg ddpg", "--methods: give one or more, each once"),

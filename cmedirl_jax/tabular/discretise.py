@@ -21,6 +21,7 @@ from cmedirl_jax.envs import Env, Step
 from cmedirl_jax.tabular import interpolation
 from cmedirl_jax.tabular.dynamics import SparseDynamics
 from cmedirl_jax.tabular.interpolation import Grid
+from cmedirl_jax.types import EnvSpec
 
 
 class FiniteMDP(flax.struct.PyTreeNode):
@@ -68,8 +69,7 @@ def make(
         raise ValueError(f"subsamples must be at least 1, got {subsamples}")
     spec, state_at = env.spec, env.state_at
     params = env.default_params if params is None else params
-    states = _over(spec.observation_low, spec.observation_high, state_shape)
-    actions = _over(spec.action_low, spec.action_high, action_shape)
+    states, actions = grids(spec, state_shape, action_shape)
     within = (np.arange(subsamples) + 0.5) / subsamples - 0.5
     offsets = np.stack(np.meshgrid(*[within] * len(states.shape)), axis=-1).reshape(
         -1, len(states.shape)
@@ -87,9 +87,11 @@ def make(
         return index.ravel(), weight.ravel() / len(offsets), jnp.mean(found.reward)
 
     over_actions = jax.vmap(of_pair, in_axes=(None, 0))
-    index, weight, reward = jax.vmap(over_actions, in_axes=(0, None))(
-        jnp.asarray(interpolation.points(states)), jnp.asarray(interpolation.points(actions))
+    # Kept from the compiler, which would evaluate all that follows from constants.
+    pairs = jax.lax.optimization_barrier(
+        (jnp.asarray(interpolation.points(states)), jnp.asarray(interpolation.points(actions)))
     )
+    index, weight, reward = jax.vmap(over_actions, in_axes=(0, None))(*pairs)
 
     def with_absorbing(leaf: jax.Array, value: float) -> jax.Array:
         return jnp.concatenate([leaf, jnp.full_like(leaf[:1], value)])
@@ -144,5 +146,15 @@ def sampled(mdp: FiniteMDP, env: Env) -> Env:
     return env._replace(step=step)
 
 
-def _over(low: np.ndarray, high: np.ndarray, shape: Sequence[int]) -> Grid:
-    return Grid(tuple(map(float, low)), tuple(map(float, high)), tuple(shape))
+def grids(
+    spec: EnvSpec, state_shape: Sequence[int], action_shape: Sequence[int]
+) -> tuple[Grid, Grid]:
+    """Grids over the bounds of the observations and of the actions."""
+
+    def over(low: np.ndarray, high: np.ndarray, shape: Sequence[int]) -> Grid:
+        return Grid(tuple(map(float, low)), tuple(map(float, high)), tuple(shape))
+
+    return (
+        over(spec.observation_low, spec.observation_high, state_shape),
+        over(spec.action_low, spec.action_high, action_shape),
+    )

@@ -1,0 +1,175 @@
+"""Maximum-entropy IRL for a continuous task, by dynamic programming on a grid.
+
+    mdp = imitation.discretised(env, settings)
+    found = imitation.fit(key, mdp, env.spec, hot_start.data(pool), kind="linear")
+    act = discretise.greedy(mdp, found.policy.action_values)
+
+This is "the original Maximum Entropy IRL" that the paper compares with, and its deep form: they
+need the model, which is the environment's own dynamics on a grid, and never act in the environment.
+
+A grid's dynamics are not those that the demonstrations followed, so mu_D - E[mu] does not vanish
+anywhere and the likelihood of Eq. 4 has no maximum: the prior and the number of steps hold the
+reward's scale.
+"""
+
+import dataclasses
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from cmedirl_jax import rewards
+from cmedirl_jax.demonstrations import DemonstrationSubset
+from cmedirl_jax.envs import Env
+from cmedirl_jax.hot_start import HotStartData
+from cmedirl_jax.tabular import discretise, interpolation, maxent
+from cmedirl_jax.tabular.discretise import FiniteMDP
+from cmedirl_jax.tabular.interpolation import Grid
+from cmedirl_jax.tabular.maxent import MaxEntResult, TabularDemonstrations
+from cmedirl_jax.types import EnvSpec, Numeric
+
+Kind = Literal["linear", "deep"]
+
+
+@dataclasses.dataclass(frozen=True)
+class TabularSettings:
+    """The grid and the fit. All static."""
+
+    states: int = 41
+    """Points along each dimension of the observation."""
+    actions: int = 7
+    """Points along each dimension of the action."""
+    subsamples: int = 1
+    """Transitions averaged for each state, along each dimension."""
+    discount: float = 0.99
+    """Discount of the soft-optimal policy and of both visitations."""
+    temperature: float = 1.0
+    """Temperature alpha of the soft-optimal policy."""
+    reward: Literal["state-action", "state"] = "state-action"
+    """Whether the reward is of pairs or of states alone."""
+    prior_precision: float = 1e-3
+    """Precision of the Gaussian prior on theta, against the log-likelihood of one demonstration."""
+    steps: int = 100
+    """Steps of Adam."""
+    centres: int = 9
+    """Radial basis functions along each dimension of the observation, of a linear reward."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Units of each hidden layer, of a deep reward."""
+    linear_learning_rate: float = 0.3
+    """Adam's rate for a linear reward."""
+    deep_learning_rate: float = 1e-2
+    """Adam's rate for a deep reward."""
+
+
+def discretised(
+    env: Env, settings: TabularSettings | None = None, *, params: Any = None
+) -> FiniteMDP:
+    """The environment on the settings' grid; `params` default to the environment's.
+
+    Raises:
+        ValueError: if `discretise.make` cannot do that.
+    """
+    settings = settings or TabularSettings()
+    states, actions = grids(env.spec, settings)
+    return discretise.make(
+        env, states.shape, actions.shape, params=params, subsamples=settings.subsamples
+    )
+
+
+def grids(spec: EnvSpec, settings: TabularSettings) -> tuple[Grid, Grid]:
+    """The grids of the observations and of the actions."""
+    return discretise.grids(
+        spec,
+        (settings.states,) * spec.observation_dim,
+        (settings.actions,) * spec.action_dim,
+    )
+
+
+def fit(
+    key: jax.Array,
+    mdp: FiniteMDP,
+    spec: EnvSpec,
+    data: HotStartData,
+    subset: DemonstrationSubset | None = None,
+    *,
+    kind: Kind,
+    settings: TabularSettings | None = None,
+) -> MaxEntResult:
+    """Fit a linear (Ziebart et al. 2008) or deep (Wulfmeier et al. 2015) reward; vmaps over seeds.
+
+    Args:
+        key: of a deep reward's first parameters.
+        mdp: the environment on a grid; pass it through `jit` rather than close over it.
+        spec: the environment's sizes and bounds.
+        data: the pool of demonstrations.
+        subset: which of them; default all.
+        kind: of the reward.
+        settings: every other choice.
+    """
+    settings = settings or TabularSettings()
+    demonstrations = visitation(mdp, data, subset, discount=settings.discount)
+    states, actions = interpolation.points(mdp.states), interpolation.points(mdp.actions)
+    # The absorbing state has no place: whatever reward its row gets, nothing earns it.
+    observation = np.append(states, np.zeros_like(states[:1]), axis=0)
+    if settings.reward == "state":
+        inputs = (observation, np.zeros((len(observation), spec.action_dim), np.float32))
+    else:
+        pairs = (len(observation), len(actions))
+        inputs = (
+            np.broadcast_to(observation[:, None], (*pairs, spec.observation_dim)),
+            np.broadcast_to(actions, (*pairs, spec.action_dim)),
+        )
+    # Kept from the compiler, which would evaluate all that follows from constants.
+    inputs = jax.lax.optimization_barrier(jax.tree.map(jnp.asarray, inputs))
+    linear = kind == "linear"
+    rate = settings.linear_learning_rate if linear else settings.deep_learning_rate
+    shared = {
+        "discount": settings.discount,
+        "temperature": settings.temperature,
+        "absorbing": mdp.absorbing,
+        "prior_precision": settings.prior_precision,
+        "optimizer": optax.adam(rate),
+        "steps": settings.steps,
+    }
+    if linear:
+        features = rewards.radial_basis(spec, settings.centres)(*inputs)
+        return maxent.maxent_irl(mdp.dynamics, features, demonstrations, **shared)
+    network = rewards.mlp(spec, settings.hidden)
+    return maxent.deep_maxent_irl(key, network, inputs, mdp.dynamics, demonstrations, **shared)
+
+
+def visitation(
+    mdp: FiniteMDP,
+    data: HotStartData,
+    subset: DemonstrationSubset | None = None,
+    *,
+    discount: Numeric,
+) -> TabularDemonstrations:
+    """mu_D and D_0 of continuous demonstrations, each step shared among the grid's neighbours.
+
+    Args:
+        mdp: whose grids.
+        data: the pool.
+        subset: which of its demonstrations; default all.
+        discount: gamma.
+    """
+    pool = jax.tree.map(jnp.asarray, data.episodes)
+    chosen = pool if subset is None else subset
+    drawn = jnp.searchsorted(pool.start, chosen.start)
+    share = jnp.where(chosen.length > 0, 1.0, 0.0) / jnp.sum(chosen.length > 0)
+    weight = jnp.zeros(pool.start.shape).at[drawn].add(share)
+    row = jnp.arange(data.transition.reward.shape[0])
+    episode = jnp.searchsorted(pool.start, row, side="right") - 1
+    time = row - pool.start[episode]
+    state, state_weight = interpolation.interpolate(mdp.states, data.transition.observation)
+    action, action_weight = interpolation.interpolate(mdp.actions, data.transition.action)
+    visits = (weight[episode] * discount**time)[:, None] * state_weight  # [N, 2^O]
+    both = visits[:, :, None] * action_weight[:, None, :]
+    starts = jnp.where(time == 0, weight[episode], 0.0)[:, None] * state_weight
+    empty = jnp.zeros_like(mdp.reward)
+    return TabularDemonstrations(
+        empty.at[state[:, :, None], action[:, None, :]].add(both),
+        empty[:, 0].at[state].add(starts),
+    )

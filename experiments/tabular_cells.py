@@ -1,0 +1,130 @@
+"""One cell of the grid whose method never acts: maximum-entropy IRL on a grid, all seeds."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax import demonstrations, seeds
+from cmedirl_jax.envs import Env
+from cmedirl_jax.evaluation import Evaluation
+from cmedirl_jax.hot_start import HotStartData
+from cmedirl_jax.methods import Method, Settings
+from cmedirl_jax.tabular import discretise, imitation
+from cmedirl_jax.tabular.discretise import FiniteMDP
+from experiments import judging
+from experiments.bookkeeping import EpisodeRows, EvaluationRows
+from experiments.cells import CellResult
+from experiments.judging import Judge
+
+
+class Fitted(NamedTuple):
+    """What each seed learned.
+
+    Attributes:
+        reward: `[S, A]`.
+        log_probabilities: `[S, A]`, of its soft-optimal policy.
+        demonstration_steps: `[]` int32, environment steps in the seed's own demonstrations.
+    """
+
+    reward: Any
+    log_probabilities: Any
+    demonstration_steps: Any
+
+
+class Programs(NamedTuple):
+    """The compiled functions of a method.
+
+    Attributes:
+        fit: `(keys [lanes], mdp, data, n_demonstrations) -> Fitted` `[lanes, ...]`.
+        mdp: the environment on the grid.
+        judge: of greedy policies, by tables of preferences `[seeds, S, A]`.
+        soft_judge: of the soft policies, by tables of log-probabilities `[seeds, S, A]`.
+        devices: that share the seeds.
+    """
+
+    fit: Any
+    mdp: FiniteMDP
+    judge: Judge
+    soft_judge: Judge
+    devices: int
+
+
+def compile_method(
+    env: Env,
+    method: Method,
+    settings: Settings,
+    *,
+    devices: list[jax.Device],
+    subset_size: int | None,
+) -> Programs:
+    """Jit a method's fit and its judges. Compiles at first use."""
+    kind = method.tabular_reward
+    assert kind is not None
+    mdp = jax.jit(lambda: imitation.discretised(env, settings.tabular))()
+
+    def of_seed(key: jax.Array, mdp: FiniteMDP, data: HotStartData, n_demonstrations: int):
+        subset_key, fit_key = jax.random.split(key)
+        subset = demonstrations.subset(subset_key, data.episodes, n_demonstrations, subset_size)
+        found = imitation.fit(
+            fit_key, mdp, env.spec, data, subset, kind=kind, settings=settings.tabular
+        )
+        steps = jnp.sum(subset.length)
+        return Fitted(found.reward, found.policy.log_probabilities, steps)
+
+    # One at a time: each seed's fixed points take as many iterations as they need.
+    fit = seeds.map_devices(seeds.map_groups(of_seed, 1), devices)
+
+    def greedy(table: jax.Array, observation: jax.Array) -> jax.Array:
+        return discretise.greedy(mdp, table)(observation)
+
+    def soft(table: jax.Array, observation: jax.Array) -> jax.Array:
+        return discretise.look_up(mdp, table, observation)
+
+    return Programs(
+        fit=jax.jit(fit),
+        mdp=mdp,
+        judge=judging.make(env, greedy, 1, devices),
+        soft_judge=judging.make(discretise.sampled(mdp, env), soft, 1, devices),
+        devices=len(devices),
+    )
+
+
+def train(
+    programs: Programs,
+    key: jax.Array,
+    data: HotStartData,
+    n_demos: int,
+    *,
+    seeds_count: int,
+    evaluation_starts: int,
+) -> CellResult:
+    """Fit every seed and evaluate its greedy policy, and as protocol "soft" its soft one, once."""
+    keys = seeds.keys(key, seeds.padded(seeds_count, 1, programs.devices))
+    fitted = jax.tree.map(
+        lambda leaf: leaf[:seeds_count], programs.fit(keys, programs.mdp, data, n_demos)
+    )
+    table = fitted.log_probabilities
+    every = np.arange(seeds_count)
+    zeros = np.zeros(seeds_count, np.int32)
+    unknown = np.full(seeds_count, np.nan)
+
+    def rows(protocol: str, found: Evaluation) -> EvaluationRows:
+        return EvaluationRows(protocol, every, zeros, zeros, found, unknown, unknown)
+
+    greedy, soft = (
+        judging.summarise(judge.on_starts(table, evaluation_starts))
+        for judge in (programs.judge, programs.soft_judge)
+    )
+    nothing = np.zeros(0, np.int32)
+    return CellResult(
+        evaluations=[rows("steps", greedy), rows("soft", soft)],
+        episodes=EpisodeRows(*(nothing for _ in EpisodeRows._fields)),
+        best=table,
+        reward=fitted.reward,
+        env_steps=zeros,
+        demonstration_steps=np.asarray(fitted.demonstration_steps),
+        diverged=~np.isfinite(fitted.reward).all(axis=(1, 2)),
+        final=table,
+    )

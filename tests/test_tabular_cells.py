@@ -1,0 +1,81 @@
+import jax
+import numpy as np
+import pytest
+
+from cmedirl_jax import evaluation, hot_start, tabular
+from cmedirl_jax.methods import METHODS, Settings
+from cmedirl_jax.tabular import discretise, imitation
+from cmedirl_jax.tabular.imitation import TabularSettings
+from experiments import tabular_cells
+from tests import pools
+
+SETTINGS = Settings(tabular=TabularSettings(states=9, actions=3, steps=2, centres=3))
+SEEDS = 3
+
+
+@pytest.fixture(scope="module")
+def programs(env):
+    return tabular_cells.compile_method(
+        env,
+        METHODS["maxent-irl"],
+        SETTINGS,
+        devices=jax.devices()[:1],
+        subset_size=4,
+    )
+
+
+def train(programs, seeds_count, n_demos=2):
+    data = hot_start.data(pools.scripted())
+    return tabular_cells.train(
+        programs, jax.random.key(3), data, n_demos, seeds_count=seeds_count, evaluation_starts=2
+    )
+
+
+@pytest.fixture(scope="module")
+def result(programs):
+    return train(programs, SEEDS)
+
+
+def test_one_evaluation_of_the_greedy_policy_and_one_of_the_soft(result, programs, env):
+    greedy, soft = result.evaluations
+    assert (greedy.protocol, soft.protocol) == ("steps", "soft")
+    for found in (greedy, soft):
+        assert found.seed.tolist() == [0, 1, 2]
+        assert found.env_step.tolist() == found.episode.tolist() == [0, 0, 0]
+        assert np.isnan(found.q_mean).all()
+    params = env.default_params
+    act = discretise.greedy(programs.mdp, result.best[1])
+    alone = evaluation.evaluate(act, env, params, 2)
+    np.testing.assert_allclose(greedy.evaluation.return_mean[1], alone.return_mean, rtol=1e-5)
+    assert (greedy.evaluation.return_mean != soft.evaluation.return_mean).any()
+
+
+def test_no_environment_step_is_taken_beyond_the_demonstrations(result):
+    assert result.env_steps.tolist() == [0, 0, 0]
+    assert len(result.episodes.seed) == 0
+    lengths = np.asarray(hot_start.data(pools.scripted()).episodes.length)
+    assert all(total in lengths[:, None] + lengths for total in result.demonstration_steps)
+    assert not result.diverged.any()
+
+
+def test_a_seed_does_what_it_does_among_more(result, programs):
+    more = train(programs, SEEDS + 2)
+    np.testing.assert_allclose(more.reward[:SEEDS], result.reward, rtol=1e-5, atol=1e-6)
+
+
+def test_the_number_of_demonstrations_does_not_recompile(programs):
+    def fitted(n_demos):
+        return train(programs, SEEDS, n_demos).demonstration_steps
+
+    before = programs.fit._cache_size()
+    assert (fitted(4) > fitted(1)).all()
+    assert programs.fit._cache_size() == before
+
+
+def test_a_policy_is_the_soft_optimal_one_of_its_reward(result, programs):
+    mdp = programs.mdp
+    policy = tabular.soft_value_iteration(
+        mdp.dynamics, result.reward[0], discount=0.99, absorbing=mdp.absorbing
+    )
+    np.testing.assert_allclose(policy.log_probabilities, result.best[0], rtol=1e-3, atol=1e-3)
+    assert imitation.discretised(pools.ENV, SETTINGS.tabular).states == mdp.states
