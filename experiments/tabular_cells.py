@@ -103,7 +103,8 @@ def train(
     """Fit every seed and evaluate its greedy policy, and as protocol "soft" its soft one, once."""
     keys = seeds.keys(key, seeds.padded(seeds_count, 1, programs.devices))
     fitted = jax.tree.map(
-        lambda leaf: leaf[:seeds_count], programs.fit(keys, programs.mdp, data, n_demos)
+        lambda leaf: np.asarray(leaf)[:seeds_count],
+        programs.fit(keys, programs.mdp, data, n_demos),
     )
     table = fitted.log_probabilities
     every = np.arange(seeds_count)
@@ -124,7 +125,7 @@ def train(
         best=table,
         reward=fitted.reward,
         env_steps=zeros,
-        demonstration_steps=np.asarray(fitted.demonstration_steps),
+        demonstration_steps=fitted.demonstration_steps,
         diverged=~np.isfinite(fitted.reward).all(axis=(1, 2)),
         final=table,
     )

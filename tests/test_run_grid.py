@@ -378,3 +378,38 @@ def test_seeds_do_not_depend_on_the_devices_that_share_them(tmp_path, compiled):
         returns.append(pl.read_parquet(out / "evaluations.parquet")["return_mean"].to_numpy())
     assert returns[0].size == 9 * 3
     np.testing.assert_allclose(*returns, rtol=1e-3, atol=1e-3)
+
+
+def test_methods_with_a_model_run_beside_the_others(compiled, demos, tmp_path):
+    methods = ("ddpg", "tabular-me-ddpg", "maxent-irl", "deep-maxent-irl")
+    tiny = {"states": 9, "actions": 3, "steps": 2, "centres": 3}
+    folder = tmp_path / "run"
+    done = run_command(
+        *(*SMOKE, "--methods", *methods, "--n-demos", 1, 2, "--demos", demos),
+        *("--seeds", 2, "--max-steps", 250, "--out", folder),
+        *(part for name, value in tiny.items() for part in (f"--tabular.{name}", value)),
+        **compiled,
+    )
+    assert done.returncode == 0, done.stderr
+    summary = pl.read_csv(folder / "summary.csv")
+    assert summary["method"].to_list() == ["ddpg", *(name for name in methods[1:] for _ in (1, 2))]
+    acts = pl.col("method").str.ends_with("ddpg")
+    modelled = summary.filter(~acts)
+    for column in modelled.columns:
+        if column.startswith(("converg", "sustained", "dip", "return_after")):
+            assert modelled[column].null_count() == 4, column
+    assert modelled["soft_return_mean"].null_count() == 0
+    assert summary.filter(acts)["soft_return_mean"].null_count() == 3
+    assert modelled["env_steps_learner"].to_list() == [0] * 4
+    assert (modelled["gymnasium_difference_max"] < 0.05).all()
+    evaluations = pl.read_parquet(folder / "evaluations.parquet").filter(~acts)
+    assert evaluations.height == 4 * 2 * 2
+    assert set(evaluations["protocol"]) == {"steps", "soft"}
+    assert set(evaluations["env_step"]) == {0}
+    for name in ("maxent-irl-n1", "deep-maxent-irl-n2", "tabular-me-ddpg-n2"):
+        reward = checkpoint.load(folder / "rewards" / name)
+        assert reward.shape[0] == 2
+        assert np.isfinite(reward).all()
+    assert {"figure3.png", "figure4.png", "figure5.png"} <= {
+        path.name for path in (folder / "figures").iterdir()
+    }

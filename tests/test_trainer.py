@@ -292,3 +292,20 @@ def test_hyperparameters_of_a_running_seed_can_be_changed():
     still = state.replace(agent=state.agent.replace(hparams=hparams))
     after, _ = advance(still, 0, 20)
     chex.assert_trees_all_equal(after.agent.critic, state.agent.critic)
+
+
+def test_a_tabular_reward_is_each_seeds_own_bounded_and_stays():
+    settings = with_(tabular={"states": 9, "actions": 3, "steps": 3, "hidden": (8,)})
+    _, state, advance = start("tabular-me-ddpg", settings)
+    _, other, _ = start("tabular-me-ddpg", settings, key=1)
+    table = np.asarray(state.reward.params)
+    assert table.shape == (81, 3)
+    np.testing.assert_allclose(np.abs(table).max(), settings.reward.bound, rtol=1e-6)
+    assert (table != np.asarray(other.reward.params)).any()
+    after, log = advance(state, 0, 40)
+    np.testing.assert_array_equal(after.reward.params, table)
+    assert log.learned.any()
+    assert (
+        np.asarray(after.agent.critic["params"]["Dense_0"]["kernel"])
+        != np.asarray(state.agent.critic["params"]["Dense_0"]["kernel"])
+    ).any()

@@ -1,0 +1,153 @@
+"""`python -m experiments.optimal_return`: what no policy can exceed, from each start.
+
+Value iteration of the environment's own reward on ever finer grids: V* undiscounted with the
+environment's time limit, and at the agent's discount without one. Beside each value stands what the
+policy that looks one step ahead by it really earns in the continuous task: that much is attainable.
+"""
+
+import dataclasses
+import functools
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+import tyro
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from cmedirl_jax import envs
+from cmedirl_jax.envs import Env
+from cmedirl_jax.tabular import discretise, interpolation
+from cmedirl_jax.tabular.discretise import FiniteMDP
+from cmedirl_jax.tabular.optimal_control import value_iteration
+from experiments import compilation
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Which grids, which discount, and where to write it."""
+
+    env: str = "MountainCarContinuous-v0"
+    """The environment, by Gymnasium's name."""
+    states: tuple[int, ...] = (101, 201, 401)
+    """Points along each dimension of the observation, a grid for each."""
+    actions: int = 21
+    """Points along each dimension of the action."""
+    discount: float = 0.99
+    """The agent's; the undiscounted optimum is found beside it."""
+    starts: int = 10
+    """Start states, evenly spaced, as in the evaluations of `tuned`."""
+    out: Path | None = None
+    """A CSV file for the table of all starts."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    options = tyro.cli(Options, prog="python -m experiments.optimal_return", args=arguments)
+    compilation.use_cache()
+    try:
+        table = optimal_returns(options)
+    except ValueError as error:
+        print(f"optimal_return: {error}", file=sys.stderr)
+        return 2
+    console = Console(width=None if sys.stdout.isatty() else 100)
+    shown = Table(title=f"means over {options.starts} start states", box=box.SIMPLE)
+    names = ("states", "discount", "value", "attained", "attained_return")
+    for name in names:
+        shown.add_column(name.replace("_", " "), justify="right")
+    means = table.group_by("states", "discount", maintain_order=True).mean()
+    for row in means.select(names).iter_rows():
+        shown.add_row(*(f"{value:.6g}" for value in row))
+    console.print(shown)
+    if options.out is not None:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        table.write_csv(options.out)
+        console.print(f"Table: {options.out}", highlight=False, soft_wrap=True)
+    return 0
+
+
+def optimal_returns(options: Options) -> pl.DataFrame:
+    """A row for each grid, discount and start.
+
+    `value` is V* by the table, `attained` what its policy earns in the same (discounted) sense, and
+    `attained_return` what that is undiscounted.
+
+    Raises:
+        ValueError: for an unknown environment, one that cannot be discretised, or a wrong size.
+    """
+    env = envs.make(options.env)
+    if options.starts < 1:
+        raise ValueError(f"starts must be at least 1, got {options.starts}")
+    spec, params = env.spec, env.default_params
+    first = np.asarray(env.starts(options.starts, params)[1])
+    rows = []
+    for size in options.states:
+        shapes = (size,) * spec.observation_dim, (options.actions,) * spec.action_dim
+        mdp = jax.jit(functools.partial(discretise.make, env, *shapes))()
+        for discount, horizon in ((1.0, spec.max_episode_steps), (options.discount, None)):
+            solve = jax.jit(functools.partial(_solve, env=env, horizon=horizon))
+            value, attained, attained_return = jax.device_get(solve(mdp, first, discount))
+            rows.append(
+                pl.DataFrame(
+                    {
+                        "states": size,
+                        "discount": discount,
+                        "start": first[:, 0],
+                        "value": value,
+                        "attained": attained,
+                        "attained_return": attained_return,
+                    }
+                )
+            )
+    return pl.concat(rows)
+
+
+def _solve(
+    mdp: FiniteMDP, first: jax.Array, discount: float, *, env: Env, horizon: int | None
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """V* at the start states, and what looking one step ahead by V* earns from them."""
+    best = value_iteration(
+        mdp.dynamics, mdp.reward, discount=discount, horizon=horizon, absorbing=mdp.absorbing
+    )
+    params = env.default_params
+    actions = jnp.asarray(interpolation.points(mdp.actions))
+    assert env.state_at is not None
+    state_at = env.state_at
+
+    def ahead(values: jax.Array, observation: jax.Array, action: jax.Array) -> jax.Array:
+        step = env.step(jax.random.key(0), state_at(observation, params), action, params)[1]
+        later = jnp.where(step.terminated, 0.0, discretise.look_up(mdp, values, step.observation))
+        return step.reward + discount * later
+
+    def advance(carry, time: jax.Array):
+        states, observation, done, earned, total = carry
+        values = best.values
+        if horizon is not None:
+            following = values[jnp.minimum(time + 1, horizon - 1)]
+            values = jnp.where(time + 1 < horizon, following, 0.0)
+        over_actions = jax.vmap(ahead, in_axes=(None, None, 0))
+        worth = jax.vmap(over_actions, in_axes=(None, 0, None))(values, observation, actions)
+        action = actions[jnp.argmax(worth, axis=-1)]
+        states, step = jax.vmap(env.step, in_axes=(None, 0, 0, None))(
+            jax.random.key(0), states, action, params
+        )
+        reward = jnp.where(done, 0.0, step.reward)
+        done = done | step.terminated | step.truncated
+        earned = earned + discount**time * reward
+        return (states, step.observation, done, earned, total + reward), None
+
+    zeros = jnp.zeros(first.shape[0])
+    states = jax.vmap(state_at, in_axes=(0, None))(first, params)
+    carry = (states, first, zeros > 0, zeros, zeros)
+    (*_, earned, total), _ = jax.lax.scan(advance, carry, jnp.arange(env.spec.max_episode_steps))
+    values = best.values if horizon is None else best.values[0]
+    return discretise.look_up(mdp, values, first), earned, total
+
+
+if __name__ == "__main__":
+    sys.exit(main())
