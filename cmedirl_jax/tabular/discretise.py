@@ -21,7 +21,7 @@ from cmedirl_jax.envs import Env, Step
 from cmedirl_jax.tabular import interpolation
 from cmedirl_jax.tabular.dynamics import SparseDynamics
 from cmedirl_jax.tabular.interpolation import Grid
-from cmedirl_jax.types import EnvSpec
+from cmedirl_jax.types import Array, EnvSpec
 
 
 class FiniteMDP(flax.struct.PyTreeNode):
@@ -106,16 +106,16 @@ def make(
     )
 
 
-def look_up(mdp: FiniteMDP, table: jax.Array, observation: jax.Array) -> jax.Array:
+def look_up(mdp: FiniteMDP, table: Array, observation: Array) -> jax.Array:
     """Interpolate a table of the states, `[S, ...]`, at observations `[..., O]`."""
     index, weight = interpolation.interpolate(mdp.states, observation)
-    rows = table[index]
+    rows = jnp.asarray(table)[index]
     return jnp.sum(
         rows * weight.reshape(weight.shape + (1,) * (table.ndim - 1)), axis=weight.ndim - 1
     )
 
 
-def greedy(mdp: FiniteMDP, action_values: jax.Array) -> Callable[[jax.Array], jax.Array]:
+def greedy(mdp: FiniteMDP, action_values: Array) -> Callable[[jax.Array], jax.Array]:
     """The policy that takes the best action of the grid: `[..., O]` -> `[..., A]`.
 
     Args:
