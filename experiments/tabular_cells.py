@@ -1,5 +1,6 @@
 """One cell of the grid whose method never acts: maximum-entropy IRL on a grid, all seeds."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -44,7 +45,7 @@ class Programs(NamedTuple):
         devices: that share the seeds.
     """
 
-    fit: Any
+    fit: Callable[..., Fitted]
     mdp: FiniteMDP
     judge: Judge
     soft_judge: Judge
