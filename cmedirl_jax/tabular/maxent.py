@@ -10,7 +10,6 @@ Gaussian log prior (Eq. 5). A reward of states alone, `[S]`, sees that differenc
 actions, as the paper writes it.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -106,17 +105,22 @@ def maxent_irl(
         ValueError: if the shapes do not fit each other.
     """
     features = jnp.asarray(features)
-    return _fit(
-        lambda theta: features @ theta,
-        jnp.zeros(features.shape[-1], features.dtype),
+    linear = Network(
+        init=lambda key: jnp.zeros(features.shape[-1], features.dtype),
+        apply=lambda theta, features: features @ theta,
+    )
+    return deep_maxent_irl(
+        jax.random.key(0),  # Nothing is drawn.
+        linear,
+        (features,),
         dynamics,
         demonstrations,
-        optimizer=optimizer or optax.lbfgs(),
         discount=discount,
         horizon=horizon,
         temperature=temperature,
         absorbing=absorbing,
         prior_precision=prior_precision,
+        optimizer=optimizer or optax.lbfgs(),
         steps=steps,
         stop=stop,
     )
@@ -146,58 +150,7 @@ def deep_maxent_irl(
         inputs: `(f [S, ...],)`, or `(f [S, A, ...], a [S, A, ...])`.
         dynamics: and all that follows as in `maxent_irl`; the default optimiser is Adam at 0.01.
     """
-    return _fit(
-        lambda params: network.apply(params, *inputs),
-        network.init(key),
-        dynamics,
-        demonstrations,
-        optimizer=optimizer or optax.adam(0.01),
-        discount=discount,
-        horizon=horizon,
-        temperature=temperature,
-        absorbing=absorbing,
-        prior_precision=prior_precision,
-        steps=steps,
-        stop=stop,
-    )
-
-
-def empirical_visitation(
-    state: Array, action: Array, mask: Array, size: tuple[int, int], *, discount: Numeric
-) -> TabularDemonstrations:
-    """Count demonstrations: mu_D and D_0.
-
-    Args:
-        state: `[N, T]` int.
-        action: `[N, T]` int.
-        mask: `[N, T]` bool, False past a demonstration's end; its first step is never past it.
-        size: (S, A).
-        discount: gamma.
-    """
-    mask = jnp.asarray(mask)
-    weight = mask * jnp.asarray(discount) ** jnp.arange(mask.shape[1]) / mask.shape[0]
-    return TabularDemonstrations(
-        jnp.zeros(size, weight.dtype).at[state, action].add(weight),
-        jnp.zeros(size[0], weight.dtype).at[jnp.asarray(state)[:, 0]].add(1.0 / mask.shape[0]),
-    )
-
-
-def _fit(
-    reward_of: Callable[[Params], jax.Array],
-    params: Params,
-    dynamics: Dynamics,
-    demonstrations: TabularDemonstrations,
-    *,
-    optimizer: optax.GradientTransformation,
-    discount: Numeric,
-    horizon: int | None,
-    temperature: Numeric,
-    absorbing: Array | None,
-    prior_precision: Numeric,
-    steps: int,
-    stop: Stop | None,
-) -> MaxEntResult:
-    tx = optax.with_extra_args_support(optimizer)
+    tx = optax.with_extra_args_support(optimizer or optax.adam(0.01))
     visited, initial = demonstrations
     shared = {
         "discount": discount,
@@ -207,7 +160,7 @@ def _fit(
     }
 
     def of_pairs(params: Params) -> jax.Array:
-        reward = reward_of(params)
+        reward = network.apply(params, *inputs)
         if reward.ndim == 1:
             reward = reward[:, None]
         return jnp.broadcast_to(reward, visited.shape)
@@ -262,8 +215,32 @@ def _fit(
         return (params, state, values, occupancy), info
 
     # Fixed points are looked for where the last ones were found.
+    params = network.init(key)
     start = (params, tx.init(params), jnp.zeros_like(initial), initial)
     (params, _, values, occupancy), info = jax.lax.scan(step, start, None, length=steps)
     reward = of_pairs(params)
     policy = solve(reward, values)
     return MaxEntResult(params, reward, policy, visits(policy, occupancy), info)
+
+
+def empirical_visitation(
+    state: Array, action: Array, mask: Array, size: tuple[int, int], *, discount: Numeric
+) -> TabularDemonstrations:
+    """Count demonstrations: mu_D and D_0.
+
+    Without a horizon they have to end in absorbing states: one that is cut off after T steps adds
+    an error of the order of gamma^T to the gradient.
+
+    Args:
+        state: `[N, T]` int.
+        action: `[N, T]` int.
+        mask: `[N, T]` bool, False past a demonstration's end; its first step is never past it.
+        size: (S, A).
+        discount: gamma.
+    """
+    mask = jnp.asarray(mask)
+    weight = mask * jnp.asarray(discount) ** jnp.arange(mask.shape[1]) / mask.shape[0]
+    return TabularDemonstrations(
+        jnp.zeros(size, weight.dtype).at[state, action].add(weight),
+        jnp.zeros(size[0], weight.dtype).at[jnp.asarray(state)[:, 0]].add(1.0 / mask.shape[0]),
+    )
