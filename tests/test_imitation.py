@@ -78,11 +78,11 @@ def test_every_reward_is_fitted_and_vmaps(data, mdp, kind, reward):
 
 @pytest.mark.optimised
 @pytest.mark.parametrize("kind", ["linear", "deep"])
-def test_the_reward_of_a_few_demonstrations_solves_the_task(kind):
-    """Greedily and softly, from most of 20 start states; the demonstrator returns about 97.7."""
+def test_the_reward_of_twelve_demonstrations_solves_the_task(kind):
+    """Greedily and softly, from each of 20 start states."""
     settings = TabularSettings()
     env, params = pools.ENV, pools.ENV.default_params
-    data = hot_start.data(pools.scripted())
+    data = hot_start.data(pools.scripted(push=0.6))
 
     @jax.jit
     def returns(data):
@@ -102,6 +102,5 @@ def test_the_reward_of_a_few_demonstrations_solves_the_task(kind):
         ]
 
     greedy, soft = returns(data)
-    # Its twelve demonstrations do not pass everywhere near: some starts lead astray.
-    assert (greedy > 90).mean() >= 0.7
-    assert (soft > 90).mean() >= 0.7
+    assert greedy.min() > 90
+    assert soft.min() > 90
