@@ -269,9 +269,11 @@ def behaviour_cloning_loss(
     networks: ActorCritic, actor: Params, hparams: DDPGHParams, demonstrations: Transition
 ) -> jax.Array:
     """w 1/D sum_i |mu(s_i) - a_i|^2 on demonstrations `[D, ...]`, added to the actor's loss."""
-    pre_activation, _ = networks_lib.train_mode(networks.actor)(actor, demonstrations.observation)
-    error = networks.squash(pre_activation) - demonstrations.action
-    return hparams.behaviour_cloning * jnp.mean(jnp.square(error))
+    # The running statistics are the replay batch's alone to move.
+    error, _ = networks_lib.imitation_error(
+        networks, actor, demonstrations.observation, demonstrations.action
+    )
+    return hparams.behaviour_cloning * error
 
 
 def _when(predicate: Numeric, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:

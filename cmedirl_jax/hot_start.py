@@ -112,7 +112,7 @@ def fit(
         actor, critic = params
         observation = pool.transition.observation[index]
         action = pool.transition.action[index]
-        actor_error, actor = actor_loss(networks, actor, observation, action)
+        actor_error, actor = networks_lib.imitation_error(networks, actor, observation, action)
         critic_error, critic = critic_loss(
             networks, critic, hparams, observation, action, pool.discounted_return[index]
         )
@@ -131,14 +131,6 @@ def fit(
         step, (params, optimizer.init(params)), jax.random.split(key, hparams.steps)
     )
     return fitted
-
-
-def actor_loss(
-    networks: ActorCritic, actor: Params, observation: jax.Array, action: jax.Array
-) -> tuple[jax.Array, Params]:
-    """Mean squared error of mu(s) to the demonstrated action: `[B, O]`, `[B, A]` -> `[]`."""
-    pre_activation, actor = networks_lib.train_mode(networks.actor)(actor, observation)
-    return jnp.mean(jnp.square(networks.squash(pre_activation) - action)), actor
 
 
 def critic_loss(

@@ -141,6 +141,21 @@ def policy(networks: ActorCritic, actor: Params, observation: jax.Array) -> jax.
     return networks.squash(networks.actor.apply(actor, observation))
 
 
+def imitation_error(
+    networks: ActorCritic, actor: Params, observation: jax.Array, action: jax.Array
+) -> tuple[jax.Array, Params]:
+    """Mean squared error of mu(s) to demonstrated actions, in training mode, and the parameters.
+
+    Args:
+        networks: whose actor.
+        actor: its parameters.
+        observation: `[B, O]`.
+        action: `[B, A]`.
+    """
+    pre_activation, actor = train_mode(networks.actor)(actor, observation)
+    return jnp.mean(jnp.square(networks.squash(pre_activation) - action)), actor
+
+
 def squashing(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
     """Tanh onto the action bounds: `[..., A]` -> `[..., A]`."""
     centre = jnp.asarray(0.5 * (spec.action_high + spec.action_low))

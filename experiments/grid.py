@@ -247,6 +247,7 @@ def _conclude(
                 of(seed_rows, cell),
                 env.spec.reward_threshold,
                 grid.max_episodes,
+                interacts=cell.method.interacts,
             )
             for cell in plan
         ],

@@ -138,7 +138,12 @@ def curves(evaluations: pl.DataFrame) -> dict[int, SeedCurve]:
 
 
 def summarise(
-    evaluations: pl.DataFrame, seeds: pl.DataFrame, threshold: float, max_episodes: int | None
+    evaluations: pl.DataFrame,
+    seeds: pl.DataFrame,
+    threshold: float,
+    max_episodes: int | None,
+    *,
+    interacts: bool = True,
 ) -> dict[str, Any]:
     """One row of summary.csv: a cell's statistics over its seeds.
 
@@ -147,6 +152,8 @@ def summarise(
         seeds: the cell's rows of seeds.parquet.
         threshold: the return that counts as solved.
         max_episodes: of the run.
+        interacts: whether the method acts in the environment; one that never does has a single
+            evaluation, and nothing to converge by.
     """
     by_seed = curves(evaluations)
     diverged = seeds["diverged"].to_numpy()
@@ -159,8 +166,6 @@ def summarise(
     ]
     columns = SeedStatistics(*(np.array(column, float) for column in zip(*found, strict=True)))
     converged = np.isfinite(columns.convergence_env_step)
-    # A method that never interacts has one evaluation, and nothing to converge by.
-    interacts = bool(seeds["env_steps"].sum())
     first = evaluations.row(0, named=True)
     dips = columns.dip_fraction[~np.isnan(columns.dip_fraction)]
     after = columns.return_after_convergence[converged]
