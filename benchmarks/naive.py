@@ -143,7 +143,7 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         index = jax.random.randint(key, (workload.batch,), 0, state.count)
         batch = {name: field[index] for name, field in state.replay.items()}
         rewards = batch["reward"]
-        if method.learned_reward:
+        if method.learns_reward:
             rewards += learned_reward(state.reward, batch["observation"], batch["action"])
         next_value = critic.apply(
             agent.target_critic,
@@ -211,7 +211,7 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
             observation=observation,
             noise=noise,
         )
-        if method.learned_reward:
+        if method.learns_reward:
             state = jax.lax.cond(
                 number % REWARD_PERIOD == 0,
                 lambda state: update_reward(state, keys[4]),

@@ -10,7 +10,7 @@ from benchmarks.workload import CAPACITY, Workload
 from cmedirl_jax import envs, hot_start, seeds
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.hot_start import HotStartHParams
-from cmedirl_jax.methods import METHODS, Settings
+from cmedirl_jax.methods import METHODS, RewardNetworkSettings, Settings
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.schedules import RewardSchedule, Schedule
 from experiments import cells, judging
@@ -25,9 +25,8 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
             critic_normalisation="layer" if workload.layer_norm else "none",
         ),
         # Never frozen, so that its cost is the same however long the benchmark runs.
-        reward_schedule=RewardSchedule(
-            stop=None, batch_size=workload.batch, hidden=workload.hidden
-        ),
+        reward_network=RewardNetworkSettings(hidden=workload.hidden),
+        reward_schedule=RewardSchedule(stop=None, batch_size=workload.batch),
         # The hot start is over before anything is timed; it need not be a good one.
         hot_start=HotStartHParams(steps=20),
         # At once, for a call that only collected would look fast; the cloning never fades either.

@@ -1,10 +1,12 @@
 """Continuous maximum-entropy deep inverse reinforcement learning with hot-started DDPG, in JAX."""
 
 from cmedirl_jax import (
+    background,
     checkpoint,
     ddpg,
     demonstrations,
     envs,
+    episodes,
     evaluation,
     exploration,
     hot_start,
@@ -19,19 +21,22 @@ from cmedirl_jax import (
     training,
 )
 from cmedirl_jax.methods import METHODS, Method, Settings
-from cmedirl_jax.types import EnvSpec, Network, Transition
+from cmedirl_jax.types import EnvSpec, Network, RewardBatch, Transition
 
 __all__ = [
     "METHODS",
     "EnvSpec",
     "Method",
     "Network",
+    "RewardBatch",
     "Settings",
     "Transition",
+    "background",
     "checkpoint",
     "ddpg",
     "demonstrations",
     "envs",
+    "episodes",
     "evaluation",
     "exploration",
     "hot_start",

@@ -113,8 +113,17 @@ def sample(
         batch_size: how many steps.
     """
     transition = pool.transition if isinstance(pool, Demonstrations) else pool
-    index = sample_index(key, subset, batch_size)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], transition)
+    return at(transition, sample_index(key, subset, batch_size))
+
+
+def sample_episodes(key: jax.Array, subset: DemonstrationSubset, count: int) -> jax.Array:
+    """Episodes of the subset, `[count]` int32, uniform with replacement; never its padding."""
+    return jax.random.randint(key, (count,), 0, jnp.sum(jnp.asarray(subset.length) > 0))
+
+
+def at(pool: Transition, index: jax.Array) -> Transition:
+    """The steps `index` `[...]` of a pool's transitions, leaves `[..., ...]`."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], pool)
 
 
 def discounted_returns(demonstrations: Demonstrations, discount: float) -> np.ndarray:

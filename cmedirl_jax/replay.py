@@ -37,6 +37,8 @@ class Replay(NamedTuple):
             An empty buffer gives zeros.
         draw: `(key, batch_size) -> bits`, the randomness of `sample`, to draw ahead of time.
         take: `(state, bits, recent=None) -> Transition`; `sample` is `take` of `draw`.
+        rows: `(state, bits, recent=None) -> index`, the rows of the storage that `take` reads.
+        at: `(state, index [...]) -> Transition`, leaves `[..., ...]`, what lies in these rows.
     """
 
     init: Callable[[], ReplayState]
@@ -44,6 +46,8 @@ class Replay(NamedTuple):
     sample: Callable[..., Transition]
     draw: Callable[[jax.Array, int], jax.Array]
     take: Callable[..., Transition]
+    rows: Callable[..., jax.Array]
+    at: Callable[[ReplayState, jax.Array], Transition]
 
 
 def make(spec: EnvSpec, capacity: int) -> Replay:
@@ -66,19 +70,24 @@ def make(spec: EnvSpec, capacity: int) -> Replay:
     def draw(key: jax.Array, batch_size: int) -> jax.Array:
         return jax.random.bits(key, (batch_size,), jnp.uint32)
 
-    def take(state: ReplayState, bits: jax.Array, recent: int | None = None) -> Transition:
+    def rows(state: ReplayState, bits: jax.Array, recent: int | None = None) -> jax.Array:
         size = jnp.minimum(state.count, capacity if recent is None else min(recent, capacity))
         # The bias of a remainder is below size / 2^32: nothing beside sampling noise.
         age = (bits % jnp.maximum(size, 1).astype(jnp.uint32)).astype(jnp.int32)
-        index = (state.count - 1 - age) % capacity
+        return (state.count - 1 - age) % capacity
+
+    def at(state: ReplayState, index: jax.Array) -> Transition:
         return unpack(spec, state.storage[index])
+
+    def take(state: ReplayState, bits: jax.Array, recent: int | None = None) -> Transition:
+        return at(state, rows(state, bits, recent))
 
     def sample(
         key: jax.Array, state: ReplayState, batch_size: int, recent: int | None = None
     ) -> Transition:
         return take(state, draw(key, batch_size), recent)
 
-    return Replay(init, add, sample, draw, take)
+    return Replay(init, add, sample, draw, take, rows, at)
 
 
 def row_size(spec: EnvSpec) -> int:

@@ -10,6 +10,8 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax.shaping import Shaping
+
 
 @dataclasses.dataclass(frozen=True)
 class RewardSchedule:
@@ -29,8 +31,21 @@ class RewardSchedule:
     """Background: the latest transitions of the replay; None: all collected so far."""
     storage: Literal["recompute", "store"] = "recompute"
     """Compute r_D anew when a transition is sampled, or store r* = r_D + r_e at collection."""
-    hidden: tuple[int, ...] = (64, 64)
-    """Units of each hidden layer of the reward network."""
+    shaping: Shaping | None = None
+    """How r_D joins r_e: r_e + r_D, r_e + gamma Phi(s') - Phi(s) with r_D(s) for Phi, or r_D
+    alone; None: as the method says."""
+    weights: Literal["uniform", "recorded", "fusion"] = "uniform"
+    """Weights of the samples: all alike, 1 / the density recorded when the action was drawn, or
+    1 / the mixture of snapshots of the policy and of the demonstrations' fitted Gaussian."""
+    snapshots: int = 8
+    """Snapshots of the policy in the mixture, the latest ones."""
+    snapshot_period: int = 250
+    """Environment steps between snapshots."""
+    trajectories: int = 8
+    """Demonstrated trajectories per update of the "trajectory" objective, and as many of the
+    background. An update costs their steps, up to the time limit of each: take a long `period`."""
+    episodes: int = 32
+    """Episodes of the background, the latest ones, that trajectories are drawn from."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,57 +8,26 @@ Every step's randomness is drawn from `fold_in(seed's key, step)`, so that what 
 neither on how many seeds run beside it nor on how its steps are cut into chunks.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import demonstrations as demonstrations_lib
-from cmedirl_jax import hot_start, methods, schedules, updates
+from cmedirl_jax import initialisation, methods, schedules, updates
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.ddpg import DDPGState
 from cmedirl_jax.demonstrations import DemonstrationSubset
 from cmedirl_jax.envs import Env
 from cmedirl_jax.hot_start import HotStartData
-from cmedirl_jax.irl import RewardState
+from cmedirl_jax.initialisation import TrainingState
+from cmedirl_jax.irl import RewardInfo, RewardState, base
 from cmedirl_jax.methods import Algorithm, Method, Settings
 from cmedirl_jax.replay import ReplayState
 from cmedirl_jax.schedules import Plan
-from cmedirl_jax.tabular import frozen, imitation
 from cmedirl_jax.types import Numeric, Params, Transition
 from cmedirl_jax.updates import Draws
-
-
-class TrainingState(flax.struct.PyTreeNode):
-    """One seed.
-
-    Attributes:
-        key: of the seed's steps; never advanced, each step folds its number into it.
-        agent: DDPG's state.
-        reward: the learned reward's state, or None.
-        storage: `[capacity, D]`, the replay's rows; its count is the number of steps taken.
-        exploration: the behaviour policy's state.
-        env: the environment's state.
-        observation: `[O]`, the current one.
-        episode: `[]` int32, finished episodes.
-        episode_return: `[]`, of the running episode.
-        episode_length: `[]` int32, of the running episode.
-        subset: the seed's own demonstrations, or None.
-    """
-
-    key: jax.Array
-    agent: DDPGState
-    reward: RewardState | None
-    storage: jax.Array
-    exploration: Any
-    env: Any
-    observation: jax.Array
-    episode: jax.Array
-    episode_return: jax.Array
-    episode_length: jax.Array
-    subset: DemonstrationSubset | None
 
 
 class Log(NamedTuple):
@@ -72,6 +41,8 @@ class Log(NamedTuple):
         learned: actor and critic were updated at this step.
         critic_loss: of that update, else 0.
         q_mean: of that update, else 0.
+        reward_learned: the reward was updated at this step.
+        reward: diagnostics of that update, else zeros; None for methods that learn no reward.
     """
 
     done: jax.Array
@@ -81,6 +52,8 @@ class Log(NamedTuple):
     learned: jax.Array
     critic_loss: jax.Array
     q_mean: jax.Array
+    reward_learned: jax.Array
+    reward: RewardInfo | None
 
 
 class Trainer(NamedTuple):
@@ -88,12 +61,8 @@ class Trainer(NamedTuple):
 
     Attributes:
         algorithm: the method's parts.
-        draw_networks: `key -> (actor, critic)`, the parameters that `init` starts from. They are
-            the same for every method, so that one compiled program may draw them for all.
-        init: `(key, data, n_demonstrations, networks=None) -> TrainingState`, the hot start and the
-            fit of a tabular reward included.
-            `data` is what `hot_start.data` made of the pool, or None for methods without
-            demonstrations; `networks` is what `draw_networks` gave, where that was called apart.
+        draw_networks: see `initialisation.Initialisation`.
+        init: likewise.
         run: `(state, data, steps, max_episodes=None) -> (TrainingState, Log)` for `steps` `[T]`
             int32, the numbers t, t + 1, ... of the environment steps to take. Under vmap leave
             `data`, `steps` and `max_episodes` unbatched: branches are taken by them. A seed that
@@ -138,78 +107,20 @@ def make(
             traced: one program for every number of demonstrations.
 
     Raises:
-        ValueError: for a method that does not act; `tabular.imitation` fits those.
+        ValueError: for a method without networks (`tabular.imitation` fits those), or settings that
+            do not fit each other.
     """
-    if not method.interacts:
+    if method.tabular and not method.interacts:
         raise ValueError(f"{method.name} does not act: there is nothing to train")
     settings = settings or Settings()
     env_params = env.default_params if env_params is None else env_params
     algorithm = methods.compose(env.spec, method, settings, capacity)
-    agent, learner, exploration, replay = algorithm
+    agent, exploration, replay = algorithm.agent, algorithm.exploration, algorithm.replay
+    background = algorithm.background
     update = updates.make(algorithm, method, settings)
-
-    def split(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        # Apart from the steps' keys: folding i into a key gives the i-th key of its split.
-        setup_key, steps_key = jax.random.split(key)
-        return jax.random.split(setup_key, 6), steps_key
-
-    def draw_networks(key: jax.Array) -> tuple[Params, Params]:
-        (agent_key, *_), _ = split(key)
-        state = agent.init(agent_key)
-        return state.actor, state.critic
-
-    def init(
-        key: jax.Array,
-        data: HotStartData | None,
-        n_demonstrations: Numeric,
-        networks: tuple[Params, Params] | None = None,
-    ) -> TrainingState:
-        (agent_key, fit_key, reward_key, env_key, noise_key, subset_key), steps_key = split(key)
-        if networks is None:
-            networks = draw_networks(key)
-        subset = None
-        if method.uses_demonstrations:
-            if data is None:
-                raise ValueError(f"{method.name} needs demonstrations")
-            subset = demonstrations_lib.subset(
-                subset_key, data.episodes, n_demonstrations, subset_size
-            )
-        if method.hot_start:
-            networks = hot_start.fit(
-                fit_key,
-                agent.networks,
-                networks,
-                data,  # type: ignore[arg-type]
-                settings.hot_start,
-                subset=subset,
-            )
-        reward = learner.init(reward_key) if learner else None
-        if method.tabular_reward is not None:
-            mdp = imitation.discretised(env, settings.tabular, params=env_params)
-            found = imitation.fit(
-                reward_key,
-                mdp,
-                env.spec,
-                data,  # type: ignore[arg-type]
-                subset,
-                kind=method.tabular_reward,
-                settings=settings.tabular,
-            )
-            reward = frozen.state(found.reward[:-1], settings.reward)
-        env_state, observation = env.reset(env_key, env_params)
-        return TrainingState(
-            key=steps_key,
-            agent=agent.init(agent_key, networks),
-            reward=reward,
-            storage=replay.init().storage,
-            exploration=exploration.init(noise_key),
-            env=env_state,
-            observation=observation,
-            episode=jnp.zeros((), jnp.int32),
-            episode_return=jnp.zeros(()),
-            episode_length=jnp.zeros((), jnp.int32),
-            subset=subset,
-        )
+    beginning = initialisation.make(
+        env, method, settings, algorithm, env_params=env_params, subset_size=subset_size
+    )
 
     def draw(key: jax.Array, subset: DemonstrationSubset | None, step: jax.Array) -> _Draws:
         keys = jax.random.split(jax.random.fold_in(key, step), 4)
@@ -228,7 +139,7 @@ def make(
         max_episodes: jax.Array | None,
     ) -> tuple[TrainingState, Log]:
         greedy = agent.act(state.agent, state.observation)
-        action, _, exploration_state = exploration.perturb(
+        action, log_density, exploration_state = exploration.perturb(
             state.exploration, greedy, draws.noise, now.step
         )
         env_state, step = env.step(draws.env, state.env, action, env_params)
@@ -237,18 +148,35 @@ def make(
         )
         replay_state = replay.add(ReplayState(state.storage, now.step), transition)
 
-        reward_state = state.reward
-        if learner is not None:
-            reward_state = jax.lax.cond(
+        ended = step.terminated | step.truncated
+
+        reward_state, background_state, reward_info = state.reward, state.background, None
+        if background is not None:
+            background_state = background.record(
+                background_state, state.agent.actor, now.step, log_density, ended
+            )
+
+            samples = functools.partial(
+                background.take,
+                background_state,
+                pool,
+                state.subset,
+                replay_state,
+                exploration_state,
+            )
+
+            reward_state, reward_info = jax.lax.cond(
                 now.learn_reward,
-                lambda reward: update.update_reward(reward, pool, replay_state, draws.updates),  # type: ignore[arg-type]
-                lambda reward: reward,
+                lambda reward: update.update_reward(reward, samples, draws.updates),
+                lambda reward: (reward, base.no_info()),
                 reward_state,
             )
 
         if update.stores_shaped:
             # Algorithm 2: the reward learns first, then r* is stored. The same row is written over.
-            shaped = update.shape(reward_state, transition, now)
+            shaped = update.shape(
+                reward_state, transition, state.agent.hparams.discount, now.reward_weight
+            )
             replay_state = replay.add(ReplayState(replay_state.storage, now.step), shaped)
 
         def learn(agent_state: DDPGState):
@@ -264,7 +192,7 @@ def make(
             state.agent,
         )
 
-        done = ended = step.terminated | step.truncated
+        done = ended
         if max_episodes is not None:
             running = state.episode < max_episodes
             done = ended & running
@@ -277,12 +205,15 @@ def make(
             learned=now.learn,
             critic_loss=critic_loss,
             q_mean=q_mean,
+            reward_learned=now.learn_reward,
+            reward=reward_info,
         )
         fresh_env, fresh_observation = draws.reset
         state = state.replace(
             agent=agent_state,
             reward=reward_state,
             storage=replay_state.storage,
+            background=background_state,
             exploration=_select(ended, exploration.reset(exploration_state), exploration_state),
             env=_select(ended, fresh_env, env_state),
             observation=_select(ended, fresh_observation, step.observation),
@@ -298,6 +229,8 @@ def make(
         steps: jax.Array,
         max_episodes: Numeric | None = None,
     ) -> tuple[TrainingState, Log]:
+        if not method.interacts:
+            raise ValueError(f"{method.name} does not act: its hot start is all of it")
         pool = None if data is None else data.transition
         # A chunk's randomness is hashed in one vectorised go, not step by step.
         draws = jax.vmap(draw, in_axes=(None, None, 0))(state.key, state.subset, steps)
@@ -313,7 +246,7 @@ def make(
     def act(params: Any, observation: jax.Array) -> jax.Array:
         return networks_lib.policy(agent.networks, params, observation)
 
-    return Trainer(algorithm, draw_networks, init, run, act)
+    return Trainer(algorithm, beginning.draw_networks, beginning.init, run, act)
 
 
 def _select(predicate: jax.Array, on_true: Any, on_false: Any) -> Any:

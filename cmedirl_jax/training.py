@@ -10,8 +10,9 @@ from cmedirl_jax import seeds as seeds_lib
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.evaluation import Evaluation
+from cmedirl_jax.initialisation import TrainingState
 from cmedirl_jax.methods import Method, Settings
-from cmedirl_jax.trainer import Log, Trainer, TrainingState, make
+from cmedirl_jax.trainer import Log, Trainer, make
 
 __all__ = ["Log", "Result", "Trainer", "TrainingState", "fit", "make"]
 

@@ -61,6 +61,24 @@ class Transition(NamedTuple):
     terminated: Any
 
 
+class RewardBatch(NamedTuple):
+    """What a reward is learned from: pairs, or whole trajectories, and how they were come by.
+
+    Attributes:
+        transition: leaves `[B, ...]`, or `[M, T, ...]` for trajectories padded to T steps.
+        log_density: `[B]`, log b(a|s) of each action under the law that it was drawn from; or
+            `[M]`, log of each trajectory's density: the sum of those over its steps, or of a
+            mixture of such products. Zeros mean uniform weights, +inf leaves an entry out of the
+            samples.
+        mask: `[B]` or `[M, T]` bool, False past an episode's end. A trajectory that is False
+            throughout counts for nothing.
+    """
+
+    transition: Transition
+    log_density: Any
+    mask: Any
+
+
 class Network(NamedTuple):
     """A function approximator as two pure functions (three when it keeps running statistics).
 

@@ -6,28 +6,30 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import demonstrations, shaping
+from cmedirl_jax import background, demonstrations, shaping
 from cmedirl_jax.ddpg import DDPGInfo, DDPGState
 from cmedirl_jax.demonstrations import DemonstrationSubset
-from cmedirl_jax.irl import RewardState
+from cmedirl_jax.irl import RewardInfo, RewardState, base, regularisers
 from cmedirl_jax.methods import Algorithm, Method, Settings
 from cmedirl_jax.replay import ReplayState
 from cmedirl_jax.schedules import Plan
-from cmedirl_jax.types import Transition
+from cmedirl_jax.types import Numeric, Transition
 
 
 class Draws(NamedTuple):
-    """The randomness of a step's minibatches.
+    """The randomness of a step's minibatches; what a method does not use is empty.
 
     Attributes:
         batch: of the agent's, from the replay.
-        background: of the reward's, from the replay; empty without a learned reward.
-        demonstrations: rows of the pool; the reward and behaviour cloning read the same ones.
+        reward: of the reward's, K iterations one after the other.
+        penalty: key of the reward's other randomness, or None.
+        cloning: rows of the pool for behaviour cloning; of pairs, the reward reads the same ones.
     """
 
     batch: jax.Array
-    background: jax.Array
-    demonstrations: jax.Array
+    reward: background.Draws
+    penalty: jax.Array | None
+    cloning: jax.Array
 
 
 class Updates(NamedTuple):
@@ -36,61 +38,82 @@ class Updates(NamedTuple):
     Attributes:
         draw: `(key, subset) -> Draws`.
         stores_shaped: r* is stored in the replay in place of r_e (static).
-        shape: `(reward_state, batch, plan) -> Transition` with r* in place of r_e (Eq. 10).
-        update_reward: `(reward_state, pool, replay_state, draws) -> RewardState`, K iterations of
-            Algorithm 1.
+        shape: `(reward_state, batch, discount, weight) -> Transition` with r* in place of r_e (Eq.
+            10).
+        update_reward: `(reward_state, samples, draws) -> (RewardState, RewardInfo)`, K iterations
+            of Algorithm 1 and the last one's diagnostics; `samples` takes `background.Draws`.
         update_agent: `(agent_state, reward_state, pool, replay_state, draws, plan) -> (DDPGState,
             DDPGInfo)`, one update on r*.
     """
 
     draw: Callable[[jax.Array, DemonstrationSubset | None], Draws]
     stores_shaped: bool
-    shape: Callable[[RewardState | None, Transition, Plan], Transition]
-    update_reward: Callable[[RewardState, Transition, ReplayState, Draws], RewardState]
+    shape: Callable[..., Transition]
+    update_reward: Callable[..., tuple[RewardState, RewardInfo]]
     update_agent: Callable[..., tuple[DDPGState, DDPGInfo]]
 
 
 def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
     """Make the updates of a method from its parts."""
-    agent, learner, _, replay = algorithm
+    agent, learner, replay = algorithm.agent, algorithm.learner, algorithm.replay
     schedule = settings.reward_schedule
     clones = method.hot_start and settings.schedule.behaviour_cloning_steps is not None
     stores_shaped = learner is not None and schedule.storage == "store"
-    reward_batch = schedule.iterations * schedule.batch_size
+    maxent = method.reward == "maxent"
+    whole = maxent and settings.reward.objective == "trajectory"
+    penalised = maxent and settings.reward.gradient_penalty is not None
+    per_iteration = schedule.trajectories if whole else schedule.batch_size
+    sampled = schedule.iterations * per_iteration if method.learns_reward else 0
     agent_batch = settings.schedule.batch_size
     # A constant, so that no branch is compiled: branches copy what passes through them.
     always_moves_targets = settings.schedule.target_period <= settings.schedule.update_period
 
     def draw(key: jax.Array, subset: DemonstrationSubset | None) -> Draws:
         batch_key, background_key, demonstrations_key = jax.random.split(key, 3)
-        nothing = jnp.zeros((0,), jnp.uint32)
-        demonstrated = max(reward_batch, agent_batch) if clones else reward_batch
+        rows = jnp.zeros((0,), jnp.int32)
+        pairs = max(agent_batch if clones else 0, 0 if whole else sampled)
+        if pairs and subset is not None:
+            rows = demonstrations.sample_index(demonstrations_key, subset, pairs)
+        chosen = rows[:sampled]
+        if whole and subset is not None:
+            chosen = demonstrations.sample_episodes(demonstrations_key, subset, sampled)
         return Draws(
             batch=replay.draw(batch_key, agent_batch),
-            background=replay.draw(background_key, reward_batch) if learner else nothing,
-            demonstrations=nothing
-            if subset is None
-            else demonstrations.sample_index(demonstrations_key, subset, demonstrated),
+            reward=background.Draws(replay.draw(background_key, sampled), chosen),
+            penalty=jax.random.fold_in(key, 3) if penalised else None,
+            cloning=rows[:agent_batch] if clones else rows[:0],
         )
 
-    def shape(reward_state: RewardState | None, batch: Transition, plan: Plan) -> Transition:
+    def shape(
+        reward_state: RewardState | None, batch: Transition, discount: Numeric, weight: Numeric
+    ) -> Transition:
         if learner is None or reward_state is None:
             return batch
         r_d = learner.reward(reward_state, batch.observation, batch.action)
-        return batch._replace(reward=shaping.additive(batch.reward, r_d, plan.reward_weight))
+        if algorithm.shaping == "potential":
+            after = learner.reward(reward_state, batch.next_observation, batch.action)
+            reward = shaping.potential(batch.reward, r_d, after, batch.terminated, discount, weight)
+            return batch._replace(reward=reward)
+        if learner.absorbing is not None:
+            r_d += regularisers.absorbed_reward(
+                learner.absorbing(reward_state), batch.terminated, discount
+            )
+        r_e = batch.reward if algorithm.shaping == "additive" else jnp.zeros_like(batch.reward)
+        return batch._replace(reward=shaping.additive(r_e, r_d, weight))
 
     def update_reward(
-        reward_state: RewardState, pool: Transition, replay_state: ReplayState, draws: Draws
-    ) -> RewardState:
+        reward_state: RewardState,
+        samples: Callable[[background.Draws], tuple[Any, Any]],
+        draws: Draws,
+    ) -> tuple[RewardState, RewardInfo]:
         assert learner is not None
+        info = base.no_info()
         for k in range(schedule.iterations):
-            rows = slice(k * schedule.batch_size, (k + 1) * schedule.batch_size)
-            reward_state, _ = learner.update(
-                reward_state,
-                _rows(pool, draws.demonstrations[rows]),
-                replay.take(replay_state, draws.background[rows], schedule.recent),
-            )
-        return reward_state
+            rows = slice(k * per_iteration, (k + 1) * per_iteration)
+            key = None if draws.penalty is None else jax.random.fold_in(draws.penalty, k)
+            batches = samples(jax.tree.map(lambda leaf, rows=rows: leaf[rows], draws.reward))
+            reward_state, info = learner.update(reward_state, *batches, key=key)
+        return reward_state, info
 
     def update_agent(
         agent_state: DDPGState,
@@ -102,7 +125,8 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
     ) -> tuple[DDPGState, DDPGInfo]:
         batch = replay.take(replay_state, draws.batch)
         if not stores_shaped:
-            batch = shape(reward_state, batch, plan)
+            discount = agent_state.hparams.discount
+            batch = shape(reward_state, batch, discount, plan.reward_weight)
         update_targets = True if always_moves_targets else plan.update_targets
         if not clones:
             return agent.update(agent_state, batch, update_targets=update_targets)
@@ -111,14 +135,10 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
         agent_state, info = agent.update(
             agent_state.replace(hparams=faded),
             batch,
-            _rows(pool, draws.demonstrations[:agent_batch]),
+            demonstrations.at(pool, draws.cloning),  # type: ignore[arg-type]
             update_targets=update_targets,
             clone=plan.cloning_weight > 0,
         )
         return agent_state.replace(hparams=hparams), info
 
     return Updates(draw, stores_shaped, shape, update_reward, update_agent)
-
-
-def _rows(pool: Any, index: jax.Array) -> Any:
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], pool)

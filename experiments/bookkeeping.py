@@ -22,6 +22,28 @@ class Budget:
     evaluation_starts_episodes: int = 100
 
 
+class Means(NamedTuple):
+    """Means over the updates since the last evaluation by steps; NaN where there was none.
+
+    Attributes:
+        q_mean: Q(s, a) over the agent's minibatches.
+        critic_loss: mean squared temporal-difference error.
+        demonstration_reward: r_D over the reward learner's demonstrations.
+        background_reward: r_D over its background.
+        effective_sample_size: of its samples' weights.
+    """
+
+    q_mean: np.ndarray
+    critic_loss: np.ndarray
+    demonstration_reward: np.ndarray
+    background_reward: np.ndarray
+    effective_sample_size: np.ndarray
+
+
+OF_AGENT = Means._fields[:2]
+OF_REWARD = Means._fields[2:]
+
+
 class EvaluationRows(NamedTuple):
     """One evaluation of the seeds that were due, leaves `[seeds due]` (numpy).
 
@@ -31,8 +53,7 @@ class EvaluationRows(NamedTuple):
         env_step: steps each had learned from.
         episode: episodes each had finished.
         evaluation: what was found.
-        q_mean: mean Q over the updates since the last evaluation; NaN before the first update.
-        critic_loss: likewise.
+        means: diagnostics of the updates before it.
     """
 
     protocol: str
@@ -40,8 +61,7 @@ class EvaluationRows(NamedTuple):
     env_step: np.ndarray
     episode: np.ndarray
     evaluation: Evaluation
-    q_mean: np.ndarray
-    critic_loss: np.ndarray
+    means: Means
 
 
 class EpisodeRows(NamedTuple):
@@ -79,7 +99,8 @@ class Book:
         self.evaluations: list[EvaluationRows] = []
         self._episodes: list[EpisodeRows] = []
         self._episode_mark = np.zeros(seeds_count, np.int32)
-        self._sums = np.zeros((3, seeds_count))
+        self._sums = Means(*(np.zeros(seeds_count) for _ in Means._fields))
+        self._updates = Means(*(np.zeros(seeds_count) for _ in Means._fields))
 
     def stepped(self, steps: np.ndarray, log: Log) -> None:
         """Record a chunk's episodes and update statistics."""
@@ -107,9 +128,15 @@ class Book:
             end = np.where(finished, steps[last] + 1, end)
         else:
             finished = np.zeros(count, bool)
-        active = (steps[None, :] < end[:, None]) & self.running[:, None] & log.learned
-        q_mean, critic_loss = (np.where(active, x, 0.0) for x in (log.q_mean, log.critic_loss))
-        self._sums += np.stack([active.sum(1), q_mean.sum(1), critic_loss.sum(1)])
+        active = (steps[None, :] < end[:, None]) & self.running[:, None]
+        for source, names, updated in (
+            (log, OF_AGENT, active & log.learned),
+            (log.reward, OF_REWARD, active & log.reward_learned),
+        ):
+            for name in names if source is not None else ():
+                found = np.where(updated, getattr(source, name), 0.0)
+                getattr(self._sums, name)[:] += found.sum(axis=1)
+                getattr(self._updates, name)[:] += updated.sum(axis=1)
         self.env_step = np.where(self.running, end, self.env_step)
         self.running &= ~finished
 
@@ -133,17 +160,15 @@ class Book:
         if not due.size:
             return
         found = jax.tree.map(lambda leaf: np.asarray(leaf)[due], found)
-        updates, q_sum, loss_sum = self._sums[:, due]
         with np.errstate(invalid="ignore"):
-            q_mean, critic_loss = q_sum / updates, loss_sum / updates
+            means = jax.tree.map(lambda total, n: total[due] / n[due], self._sums, self._updates)
         self.evaluations.append(
-            EvaluationRows(
-                protocol, due, self.env_step[due], self.episode[due], found, q_mean, critic_loss
-            )
+            EvaluationRows(protocol, due, self.env_step[due], self.episode[due], found, means)
         )
         if protocol == "steps":
             self.latest[due] = found.return_mean
-            self._sums[:, due] = 0.0
+            for totals in (*self._sums, *self._updates):
+                totals[due] = 0.0
 
     def solved_fraction(self, threshold: float) -> float:
         """Share of all seeds whose latest evaluation reaches the threshold."""

@@ -84,7 +84,7 @@ def _train_cells(
     devices: list[jax.Device],
     console: Console,
 ) -> None:
-    budget = planning.budget_of(grid, env)
+    budget = planning.budget_of(grid, env, METHODS["ddpg"])
     pool_path = grid.folder / "demonstrations" / "pool.npz"
     needs_pool = any(cell.n_demos for cell in todo)
     pool = given if given is not None else _reusable(pool_path, env)
@@ -123,7 +123,7 @@ def _train_cells(
             demonstrations.save(pool_path, pool)
         for cell in todo:
             report.start(f"{cell.name}, {grid.seeds} seeds")
-            if cell.method.interacts:
+            if cell.method.tabular is None or cell.method.interacts:
                 programs = compile_method(cell.method, grid.settings)
                 result = cells.train(
                     programs,
@@ -131,7 +131,7 @@ def _train_cells(
                     data if cell.n_demos else None,
                     cell.n_demos,
                     seeds_count=grid.seeds,
-                    budget=budget,
+                    budget=planning.budget_of(grid, env, cell.method),
                     threshold=env.spec.reward_threshold,
                     report=_stepwise(report, grid.seeds),
                 )

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from cmedirl_jax import demonstrations, envs, networks, rewards
+from cmedirl_jax import demonstrations, envs, methods, networks, rewards
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.methods import METHODS, Method
@@ -35,9 +35,9 @@ def cells_of(grid: Grid) -> list[Cell]:
     ]
 
 
-def budget_of(grid: Grid, env: Env) -> Budget:
-    """How long each learner trains."""
-    most = [grid.max_steps]
+def budget_of(grid: Grid, env: Env, method: Method) -> Budget:
+    """How long each learner of a method trains; not at all where it never acts."""
+    most = [grid.max_steps if method.interacts else 0]
     if grid.max_episodes is not None:
         most.append(grid.max_episodes * env.spec.max_episode_steps)
     return Budget(
@@ -78,12 +78,17 @@ def check(grid: Grid) -> None:
         networks.make(env.spec, grid.settings.architecture)
     except ValueError as error:
         raise UserError(f"--architecture: {error}") from error
-    if any(METHODS[name].tabular_reward for name in grid.methods):
+    if any(METHODS[name].tabular for name in grid.methods):
         try:
             jax.eval_shape(lambda: imitation.discretised(env, grid.settings.tabular))
             rewards.radial_basis(env.spec, grid.settings.tabular.centres)
         except ValueError as error:
             raise UserError(f"--tabular: {error}") from error
+    for name in grid.methods:
+        try:
+            methods.compose(env.spec, METHODS[name], grid.settings, capacity=1)
+        except ValueError as error:
+            raise UserError(f"--methods {name}: {error}") from error
     if grid.demos is None:
         check_enough(grid, grid.experts.trajectories)
 
@@ -122,7 +127,17 @@ def _positive(grid: Grid) -> list[tuple[str, float | None]]:
         (
             "reward_schedule",
             settings.reward_schedule,
-            ("period", "iterations", "anneal_steps", "batch_size", "recent"),
+            (
+                "period",
+                "iterations",
+                "anneal_steps",
+                "batch_size",
+                "recent",
+                "snapshots",
+                "snapshot_period",
+                "trajectories",
+                "episodes",
+            ),
         ),
         ("hot_start", settings.hot_start, ("steps", "cells", "batch_size")),
         ("tabular", settings.tabular, ("subsamples", "steps")),
@@ -135,7 +150,7 @@ def _positive(grid: Grid) -> list[tuple[str, float | None]]:
     for prefix, options, names in groups:
         named += [(f"{prefix}.{name}", getattr(options, name)) for name in names]
     named += [("architecture.hidden", units) for units in settings.architecture.hidden]
-    named += [("reward_schedule.hidden", units) for units in settings.reward_schedule.hidden]
+    named += [("reward_network.hidden", units) for units in settings.reward_network.hidden]
     named += [("tabular.hidden", units) for units in settings.tabular.hidden]
     return named
 

@@ -86,7 +86,7 @@ _PAPER_SETTINGS = Settings(
     ),
     exploration=ExplorationSettings(kind="epsilon-greedy"),
     reward=IRLHParams(
-        learning_rate=1e-5, bound=float("inf"), output_penalty=0.0, prior_precision=1e-3
+        learning_rate=1e-5, bounded_by="none", output_penalty=0.0, prior_precision=1e-3
     ),
     reward_schedule=RewardSchedule(period=1, stop=None, recent=None, storage="store"),
     hot_start=HotStartHParams(critic="softmax"),

@@ -43,8 +43,7 @@ def rows(
                 "env_step": found.env_step.astype(np.int32),
                 "episode": found.episode.astype(np.int32),
                 **{name: np.asarray(x) for name, x in found.evaluation._asdict().items()},
-                "q_mean": found.q_mean,
-                "critic_loss": found.critic_loss,
+                **found.means._asdict(),
             }
         )
         for found in result.evaluations

@@ -15,7 +15,7 @@ from cmedirl_jax.methods import Method, Settings
 from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from experiments import judging
-from experiments.bookkeeping import EpisodeRows, EvaluationRows
+from experiments.bookkeeping import EpisodeRows, EvaluationRows, Means
 from experiments.cells import CellResult
 from experiments.judging import Judge
 
@@ -61,7 +61,7 @@ def compile_method(
     subset_size: int | None,
 ) -> Programs:
     """Jit a method's fit and its judges. Compiles at first use."""
-    kind = method.tabular_reward
+    kind = method.tabular
     assert kind is not None
     mdp = jax.jit(lambda: imitation.discretised(env, settings.tabular))()
 
@@ -110,10 +110,10 @@ def train(
     table = fitted.log_probabilities
     every = np.arange(seeds_count)
     zeros = np.zeros(seeds_count, np.int32)
-    unknown = np.full(seeds_count, np.nan)
+    unknown = Means(*(np.full(seeds_count, np.nan) for _ in Means._fields))
 
     def rows(protocol: str, found: Evaluation) -> EvaluationRows:
-        return EvaluationRows(protocol, every, zeros, zeros, found, unknown, unknown)
+        return EvaluationRows(protocol, every, zeros, zeros, found, unknown)
 
     greedy, soft = (
         judging.summarise(judge.on_starts(table, evaluation_starts))

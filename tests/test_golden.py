@@ -50,7 +50,7 @@ def short_run(name):
         "actor": norms(state.agent.actor),
         "critic": norms(state.agent.critic),
         "target_critic": norms(state.agent.target_critic),
-        "reward": [] if state.reward is None else norms(state.reward.params),
+        "reward": [] if state.reward is None else norms(state.reward.params.network),
         "observation": state.observation,
         "episode_return": state.episode_return,
         "replay": norms(state.storage),

@@ -60,7 +60,9 @@ def test_no_environment_step_is_taken_beyond_the_demonstrations(result):
 
 def test_a_seed_does_what_it_does_among_more(result, programs):
     more = train(programs, SEEDS + 2)
-    np.testing.assert_allclose(more.reward[:SEEDS], result.reward, rtol=1e-5, atol=1e-6)
+    # Adam's first steps have the size of its rate, also along gradients that are all rounding.
+    alike, other = (np.abs(more.reward[i : i + SEEDS] - result.reward).max() for i in (0, 1))
+    assert alike < 0.01 < 0.1 < other
 
 
 def test_the_number_of_demonstrations_does_not_recompile(programs):

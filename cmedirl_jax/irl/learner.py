@@ -5,17 +5,20 @@ state = learner.init(jax.random.key(0))
 state, info = jax.jit(learner.update)(state, demonstrations, background)
 """
 
-from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from cmedirl_jax import optimizers, rewards
-from cmedirl_jax.irl import objectives
-from cmedirl_jax.types import EnvSpec, Network, Params, Transition
+from cmedirl_jax.irl import base, objectives, regularisers
+from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
+from cmedirl_jax.irl.objectives import Likelihood, Objective, Scored
+from cmedirl_jax.irl.regularisers import BoundKind, Gauge
+from cmedirl_jax.types import EnvSpec, Network, Params, RewardBatch, Transition
 
 
 class IRLHParams(flax.struct.PyTreeNode):
@@ -24,76 +27,56 @@ class IRLHParams(flax.struct.PyTreeNode):
     learning_rate: float = 1e-3
     """Adam's rate for the reward network."""
     bound: float = 0.1
-    """r_D = bound * tanh(f(s, a)); inf for r_D = f(s, a)."""
+    """Largest magnitude of r_D, before any gauge."""
     output_penalty: float = 0.05
     """Weight of the mean squared f(s, a) against the log-likelihood; keeps tanh off its ends."""
     prior_precision: float = 0.0
     """Precision lambda of the Gaussian prior, log P(theta) = -lambda/2 ||theta||^2 (Eq. 4)."""
+    gradient_penalty: float | None = None
+    """Weight of the squared gradient of f at points between demonstrations and background, by
+    inputs in half-widths of their ranges; None: no such term, nor its cost."""
+    gradient_penalty_target: float = 0.0
+    """Norm of the gradient that is not penalised (Gulrajani et al. 2017: 1)."""
+    gauge_rate: float = 0.05
+    """Share of the gauge's offset that each update moves to that of its batch."""
+    discount: float = 1.0
+    """Discount of a trajectory's return; only 1 makes its optimum that of `tabular.maxent`."""
+    weight_exponent: float = 1.0
+    """Exponent of importance weights: 1 as they are, 0 uniform."""
+    weight_limit: float = float("inf")
+    """Largest distance of an importance weight's logarithm from the batch's mean."""
+    objective: Objective = flax.struct.field(pytree_node=False, default="visitation")
+    """How E[mu] is estimated, see `irl.objectives`; the last takes trajectories."""
+    bounded_by: BoundKind = flax.struct.field(pytree_node=False, default="tanh")
+    """r_D = bound * tanh(f), f clipped to +-bound, or f itself."""
+    gauge: Gauge = flax.struct.field(pytree_node=False, default="none")
+    """Constant taken off r_D: none, its background mean, or the demonstrations' largest."""
+    absorbing: bool = flax.struct.field(pytree_node=False, default=False)
+    """Learn the reward of an absorbing state after termination (Kostrikov et al. 2019)."""
     append_demonstrations: bool = flax.struct.field(pytree_node=False, default=True)
     """Append the demonstration batch to the background batch (Algorithm 1, line 4)."""
 
 
-class RewardState(flax.struct.PyTreeNode):
-    """The reward network's parameters, its optimiser and the hyperparameters."""
-
-    params: Params
-    optimizer: optax.OptState
-    hparams: IRLHParams
-
-
-class RewardInfo(NamedTuple):
-    """Diagnostics of one update, all `[]`, of the state before it.
+class RewardParams(NamedTuple):
+    """Parameters of r_D.
 
     Attributes:
-        demonstration_reward: mean r_D over the demonstration batch.
-        background_reward: mean r_D over the background batch, without appended demonstrations.
-        log_prior: log P(theta) up to its constant.
-        gradient_norm: global norm of dL/dtheta (Eq. 5), penalties included.
+        network: of f.
+        offset: `[]`, the gauge's constant, which r_D lies below f's bounded value by.
+        absorbing: `[]`, f of the absorbing state; None where there is none.
     """
 
-    demonstration_reward: jax.Array
-    background_reward: jax.Array
-    log_prior: jax.Array
-    gradient_norm: jax.Array
+    network: Params
+    offset: jax.Array
+    absorbing: jax.Array | None
 
 
-class UpdateFn(Protocol):
-    """One iteration of Algorithm 1, lines 4-6."""
+class _Steps(NamedTuple):
+    """All steps of a batch: observations `[P, O]`, actions `[P, A]`, and which of them count."""
 
-    def __call__(
-        self,
-        state: RewardState,
-        demonstrations: Transition,
-        background: Transition,
-        *,
-        key: jax.Array | None = None,
-    ) -> tuple[RewardState, RewardInfo]:
-        """Take a step along the sampled estimate of dL/dtheta, L = log P(D | r) + log P(theta).
-
-        Args:
-            state: the state before.
-            demonstrations: the demonstration batch, leaves `[D, ...]`.
-            background: the background batch, leaves `[B, ...]`.
-            key: for learners that draw; this one does not.
-
-        Raises:
-            ValueError: if a batch's observations or actions are not `[., O]` and `[., A]`.
-        """
-        ...
-
-
-class RewardLearner(NamedTuple):
-    """A learner of rewards as pure functions.
-
-    Attributes:
-        init: `(key) -> RewardState`.
-        reward: `(state, observation [..., O], action [..., A]) -> [...]`, r_D(s, a; theta).
-        update: see `UpdateFn`.
-    """
-
-    init: Callable[[jax.Array], RewardState]
-    reward: Callable[[RewardState, jax.Array, jax.Array], jax.Array]
-    update: UpdateFn
+    observation: jax.Array
+    action: jax.Array
+    mask: jax.Array
 
 
 def make(
@@ -115,76 +98,161 @@ def make(
     hparams = hparams or IRLHParams()
     network = network or rewards.mlp(spec)
     tx = optax.with_extra_args_support(optimizer or optimizers.adam())
+    checked = base.trajectories if hparams.objective == "trajectory" else base.pairs
+    units = _units(spec)
 
     def init(key: jax.Array) -> RewardState:
-        params = network.init(key)
-        traced = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams)
-        return RewardState(params, tx.init(params), traced)
+        absorbing = jnp.zeros(()) if hparams.absorbing else None
+        params = RewardParams(network.init(key), jnp.zeros(()), absorbing)
+        learned: Any = (params.network, params.absorbing)
+        return RewardState(params, tx.init(learned), base.traced(hparams))
+
+    def bounded(output: jax.Array, hparams: IRLHParams) -> jax.Array:
+        return regularisers.bounded(output, hparams.bound, hparams.bounded_by)
 
     def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
-        return rewards.bounded(
-            network.apply(state.params, observation, action), state.hparams.bound
+        output = network.apply(state.params.network, observation, action)
+        return bounded(output, state.hparams) - state.params.offset
+
+    def absorbing(state: RewardState) -> jax.Array:
+        return bounded(state.params.absorbing, state.hparams) - state.params.offset
+
+    def slope(
+        params: Params, steps: tuple[_Steps, ...], hparams: IRLHParams, key: jax.Array | None
+    ) -> jax.Array:
+        if key is None:
+            raise ValueError("a gradient penalty draws the points it is taken at: pass a key")
+        ends = [(of.observation, of.action) for of in steps]
+        observation, action = regularisers.interpolate(key, ends[0], ends[1])
+        size = observation.shape[0]
+        return regularisers.gradient_penalty(
+            lambda observation, action: network.apply(params, observation, action),
+            observation,
+            action,
+            steps[0].mask[:size] & steps[1].mask[:size],
+            scale=units,
+            target=hparams.gradient_penalty_target,
         )
 
     def update(
         state: RewardState,
-        demonstrations: Transition,
-        background: Transition,
+        demonstrations: Transition | RewardBatch,
+        background: Transition | RewardBatch,
         *,
         key: jax.Array | None = None,
     ) -> tuple[RewardState, RewardInfo]:
-        del key
-        _check_pairs(spec, demonstrations, "demonstrations")
-        _check_pairs(spec, background, "background")
-        n_demonstrations = demonstrations.action.shape[0]
-        n_background = background.action.shape[0]
-        observation = jnp.concatenate([demonstrations.observation, background.observation])
-        action = jnp.concatenate([demonstrations.action, background.action])
+        batches = (
+            checked(spec, demonstrations, "demonstrations"),
+            checked(spec, background, "background"),
+        )
+        steps = tuple(_steps(batch) for batch in batches)
+        every = _Steps(*map(jnp.concatenate, zip(*steps, strict=True)))
 
-        output, vjp = jax.vjp(
-            lambda params: network.apply(params, observation, action), state.params
-        )
-        r_d, bound_vjp = jax.vjp(lambda f: rewards.bounded(f, state.hparams.bound), output)
-        difference = jnp.concatenate(
-            objectives.visitation_difference(
-                n_demonstrations, n_background, append=state.hparams.append_demonstrations
-            )
-        )
-        penalty = 2.0 * state.hparams.output_penalty * output / output.size
-        # Eqs. 5, 6 and 9 with a loss's sign: the difference in visitation is the error signal.
-        (likelihood_gradient,) = vjp(penalty - bound_vjp(difference)[0])
-        gradient = jax.tree.map(
-            lambda data, theta: data + state.hparams.prior_precision * theta,
-            likelihood_gradient,
-            state.params,
+        def negative_posterior(learned: Any):
+            params, absorbed = learned
+            output = network.apply(params, every.observation, every.action)
+            found = jnp.split(bounded(output, state.hparams), steps[0].mask.shape)
+            if absorbed is not None:
+                absorbed = bounded(absorbed, state.hparams)
+            likelihood = log_likelihood(state.hparams, batches, found, absorbed)
+            log_prior = regularisers.log_prior(learned, state.hparams.prior_precision)
+            penalty = regularisers.output_penalty(output, every.mask)
+            loss = state.hparams.output_penalty * penalty - (likelihood.value + log_prior)
+            if state.hparams.gradient_penalty is not None:
+                loss += state.hparams.gradient_penalty * slope(params, steps, state.hparams, key)
+            return loss, (found, likelihood, log_prior)
+
+        learned: Any = (state.params.network, state.params.absorbing)
+        gradient, (found, likelihood, log_prior) = jax.grad(negative_posterior, has_aux=True)(
+            learned
         )
         updates, optimizer_state = tx.update(
-            gradient, state.optimizer, state.params, learning_rate=state.hparams.learning_rate
+            gradient, state.optimizer, learned, learning_rate=state.hparams.learning_rate
         )
+        scored = [(r_d, of.mask) for r_d, of in zip(found, steps, strict=True)]
+        offset = state.params.offset
         info = RewardInfo(
-            demonstration_reward=jnp.mean(r_d[:n_demonstrations]),
-            background_reward=jnp.mean(r_d[n_demonstrations:]),
-            log_prior=-0.5
-            * state.hparams.prior_precision
-            * optax.tree.norm(state.params, squared=True),
+            *(regularisers.masked_mean(*one) - offset for one in scored),
+            log_likelihood=likelihood.value,
+            log_prior=log_prior,
             gradient_norm=optax.tree.norm(gradient),
+            effective_sample_size=likelihood.effective_sample_size,
         )
-        state = state.replace(
-            params=optax.apply_updates(state.params, updates), optimizer=optimizer_state
-        )
-        return state, info
+        if state.hparams.gauge != "none":
+            target = regularisers.gauge_offset(state.hparams.gauge, *scored)
+            offset = offset + state.hparams.gauge_rate * (target - offset)
+        moved: Any = optax.apply_updates(learned, updates)
+        params = RewardParams(moved[0], offset, moved[1])
+        return state.replace(params=params, optimizer=optimizer_state), info
 
-    return RewardLearner(init, reward, update)
+    return RewardLearner(init, reward, update, absorbing if hparams.absorbing else None)
 
 
-def _check_pairs(spec: EnvSpec, batch: Transition, name: str) -> None:
-    size = batch.observation.shape[:1]
-    if (
-        not size
-        or batch.observation.shape != (*size, spec.observation_dim)
-        or batch.action.shape != (*size, spec.action_dim)
-    ):
-        raise ValueError(
-            f"{name}: expected observations [B, {spec.observation_dim}] and actions "
-            f"[B, {spec.action_dim}], got {batch.observation.shape} and {batch.action.shape}"
-        )
+def log_likelihood(
+    hparams: IRLHParams,
+    batches: tuple[RewardBatch, RewardBatch],
+    found: list[jax.Array],
+    absorbed: jax.Array | None,
+) -> Likelihood:
+    """L_D by the objective that `hparams` name.
+
+    Args:
+        hparams: the hyperparameters.
+        batches: demonstrations and background.
+        found: r_D of each batch's pairs, `[B]`, or `[M * T]` for trajectories.
+        absorbed: `[]`, r_D of the absorbing state, or None without one.
+    """
+    score = _score_trajectories if hparams.objective == "trajectory" else _score_pairs
+    demonstrations, background = (
+        score(hparams, batch, r_d, absorbed) for batch, r_d in zip(batches, found, strict=True)
+    )
+    objective = getattr(objectives, hparams.objective)
+    return objective(demonstrations, background, append=hparams.append_demonstrations)
+
+
+def _score_pairs(
+    hparams: IRLHParams, batch: RewardBatch, r_d: jax.Array, absorbed: jax.Array | None
+) -> Scored:
+    scored = Scored(r_d, _log_weights(hparams, batch.log_density, batch.mask), batch.mask)
+    if absorbed is None:
+        return scored
+    # After each termination one more sample, of the absorbing state.
+    follows = batch.mask & batch.transition.terminated
+    after = Scored(jnp.full_like(r_d, absorbed), scored.log_weight, follows)
+    return Scored(*map(jnp.concatenate, zip(scored, after, strict=True)))
+
+
+def _score_trajectories(
+    hparams: IRLHParams, batch: RewardBatch, r_d: jax.Array, absorbed: jax.Array | None
+) -> Scored:
+    mask, r_d = batch.mask, r_d.reshape(batch.mask.shape)
+    some = jnp.any(mask, axis=-1)
+    if absorbed is not None:
+        # The absorbing state takes the rest of the horizon.
+        r_d = jnp.where(mask, r_d, absorbed)
+        mask |= jnp.any(mask & batch.transition.terminated, axis=-1, keepdims=True)
+    total = objectives.returns(r_d, mask, hparams.discount)
+    return Scored(total, _log_weights(hparams, batch.log_density, some), some)
+
+
+def _log_weights(hparams: IRLHParams, log_density: jax.Array, mask: jax.Array) -> jax.Array:
+    return objectives.log_weights(
+        log_density, mask, exponent=hparams.weight_exponent, limit=hparams.weight_limit
+    )
+
+
+def _steps(batch: RewardBatch) -> _Steps:
+    observation, action = batch.transition.observation, batch.transition.action
+    return _Steps(
+        observation.reshape(-1, observation.shape[-1]),
+        action.reshape(-1, action.shape[-1]),
+        batch.mask.reshape(-1),
+    )
+
+
+def _units(spec: EnvSpec) -> tuple[jax.Array, jax.Array]:
+    """Half-widths of the ranges of observations and actions; 1 where a range is infinite."""
+    low = (spec.observation_low, spec.action_low)
+    high = (spec.observation_high, spec.action_high)
+    widths = [0.5 * (above - below) for below, above in zip(low, high, strict=True)]
+    return tuple(jnp.asarray(np.where(np.isfinite(width), width, 1.0)) for width in widths)  # type: ignore[return-value]

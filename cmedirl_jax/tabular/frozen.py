@@ -3,10 +3,9 @@
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax.irl import IRLHParams, RewardInfo, RewardLearner, RewardState
+from cmedirl_jax.irl import IRLHParams, RewardLearner, RewardState, base
 from cmedirl_jax.tabular import interpolation
 from cmedirl_jax.tabular.interpolation import Grid
-from cmedirl_jax.types import Transition
 
 
 def make(states: Grid, actions: Grid, hparams: IRLHParams | None = None) -> RewardLearner:
@@ -29,18 +28,7 @@ def make(states: Grid, actions: Grid, hparams: IRLHParams | None = None) -> Rewa
         values = state.params[row[..., :, None], column[..., None, :]]
         return jnp.einsum("...rc,...r,...c->...", values, row_weight, column_weight)
 
-    def update(
-        state: RewardState,
-        demonstrations: Transition,
-        background: Transition,
-        *,
-        key: jax.Array | None = None,
-    ) -> tuple[RewardState, RewardInfo]:
-        del demonstrations, background, key
-        nothing = jnp.zeros(())
-        return state, RewardInfo(nothing, nothing, nothing, nothing)
-
-    return RewardLearner(init, reward, update)
+    return RewardLearner(init, reward, base.learn_nothing)
 
 
 def state(table: jax.Array, hparams: IRLHParams) -> RewardState:
@@ -55,5 +43,4 @@ def state(table: jax.Array, hparams: IRLHParams) -> RewardState:
     """
     largest = jnp.max(jnp.abs(table))
     scaled = hparams.bound * table / jnp.where(largest > 0, largest, 1.0)
-    traced = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams)
-    return RewardState(scaled, (), traced)
+    return RewardState(scaled, (), base.traced(hparams))
