@@ -74,7 +74,7 @@ class Background(NamedTuple):
 
 
 class _Sampled(NamedTuple):
-    """Transitions `[B, ...]` or `[M, T, ...]`, which of them are there, their rows in the replay."""
+    """Transitions `[B, ...]` or `[M, T, ...]`, which are there, and their rows in the replay."""
 
     transition: Transition
     mask: jax.Array
