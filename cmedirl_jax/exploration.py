@@ -1,19 +1,24 @@
-"""Behaviour policies around a deterministic actor, each with its density.
+"""Behaviour policies around a deterministic actor, each with its densities.
 
 The paper contradicts itself: Algorithm 2 adds a noise process, section 4.1 is epsilon-greedy. Both
-are here. Every `log_density` is with respect to one base measure: Lebesgue measure inside the
-action bounds, plus a unit mass at each bound of each dimension where clipping puts one, plus (for
-the epsilon-greedy kind) a unit mass at the greedy action mu(s) and at an action being held.
+are here. Every log density is with respect to the base measure of `irl.densities`: Lebesgue measure
+inside the action bounds and a unit mass at each bound of each dimension. An action that the law has
+an atom at elsewhere has log density inf.
+
+Two densities belong to an action: the one that `perturb` returns when it is taken, given the
+noise's state, and `Exploration.log_density`, of the state's greedy action alone, which can be asked
+of any policy about any action and is what mixtures of policies are made of.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from cmedirl_jax.irl import densities
 from cmedirl_jax.types import EnvSpec, Numeric
 
 
@@ -34,9 +39,13 @@ class Exploration(NamedTuple):
         init: `(key) -> state`, at the start of a run.
         reset: `(state) -> state`, at the start of an episode.
         sample: `(key, state, action, step) -> (action, log_density, state)`; `action` `[A]` in is
-            mu(s), out is what the behaviour policy does; `log_density` `[]` is its log b(a|s).
+            mu(s), out is what the behaviour policy does; `log_density` `[]` is its log b(a|s),
+            given the noise's state.
         draw: `(key) -> noise`, the randomness of `sample`, to draw ahead of time.
         perturb: see `PerturbFn`; `sample` is `perturb` of `draw`.
+        log_density: `(state, greedy [..., A], action [..., A], step) -> [...]`, the log density of
+            the marginal law of the action where mu(s) is `greedy`; of `state` it reads the
+            hyperparameters alone.
     """
 
     init: Callable[[jax.Array], Any]
@@ -44,6 +53,7 @@ class Exploration(NamedTuple):
     sample: Callable[..., tuple[jax.Array, jax.Array, Any]]
     draw: Callable[[jax.Array], Any]
     perturb: PerturbFn
+    log_density: Callable[[Any, jax.Array, jax.Array, Numeric], jax.Array]
 
 
 class GaussianHParams(flax.struct.PyTreeNode):
@@ -73,6 +83,9 @@ class EpsilonGreedyHParams(flax.struct.PyTreeNode):
     """Environment steps over which epsilon falls linearly."""
     hold: float = 1.0
     """Steps for which a random action is held (1: the paper's letter)."""
+    noise: float | None = None
+    """Standard deviation of Gaussian noise on mu(s), in half-widths of the action range. None for
+    none, as in the paper; that is static, a number is not."""
 
 
 class OrnsteinUhlenbeckState(flax.struct.PyTreeNode):
@@ -95,16 +108,19 @@ def gaussian(spec: EnvSpec, hparams: GaussianHParams | None = None) -> Explorati
     hparams = hparams or GaussianHParams()
 
     def perturb(state: GaussianHParams, action: jax.Array, noise: jax.Array, step: Numeric):
+        noisy = _clip(spec, action + state.scale * _half_width(spec) * noise)
+        return noisy, log_density(state, action, noisy, step), state
+
+    def log_density(state: GaussianHParams, greedy: jax.Array, action: jax.Array, step: Numeric):
         del step
-        scale = state.scale * _half_width(spec)
-        action, log_density = _clipped_normal(spec, action, scale, noise)
-        return action, log_density, state
+        return densities.clipped_normal(spec, greedy, state.scale * _half_width(spec), action)
 
     return _exploration(
         init=lambda key: _traced(hparams),
         reset=lambda state: state,
         draw=lambda key: jax.random.normal(key, (spec.action_dim,)),
         perturb=perturb,
+        log_density=log_density,
     )
 
 
@@ -113,7 +129,9 @@ def ornstein_uhlenbeck(
 ) -> Exploration:
     """clip(mu(s) + x_t), x_t = (1 - theta) x_{t-1} + sigma eps_t, x_0 = 0 at each episode.
 
-    The density is conditional on x_{t-1}.
+    The density recorded is conditional on x_{t-1}. The marginal one is of x's stationary law,
+    N(0, sigma^2 / (1 - (1 - theta)^2)), which is an approximation: at an episode's first steps x is
+    smaller, and later the state s that it led to says something about it. It needs 0 < theta < 2.
     """
     hparams = hparams or OrnsteinUhlenbeckHParams()
 
@@ -125,63 +143,95 @@ def ornstein_uhlenbeck(
         del step
         mean = (1.0 - state.hparams.theta) * state.value
         scale = state.hparams.sigma * _half_width(spec)
-        noisy, log_density = _clipped_normal(spec, action + mean, scale, noise)
+        noisy = _clip(spec, action + mean + scale * noise)
+        log_density = densities.clipped_normal(spec, action + mean, scale, noisy)
         return noisy, log_density, state.replace(value=mean + scale * noise)
+
+    def log_density(
+        state: OrnsteinUhlenbeckState, greedy: jax.Array, action: jax.Array, step: Numeric
+    ):
+        del step
+        theta, sigma = state.hparams.theta, state.hparams.sigma
+        stationary = sigma * _half_width(spec) / jnp.sqrt(theta * (2.0 - theta))
+        return densities.clipped_normal(spec, greedy, stationary, action)
 
     return _exploration(
         init=init,
         reset=lambda state: state.replace(value=jnp.zeros_like(state.value)),
         draw=lambda key: jax.random.normal(key, (spec.action_dim,)),
         perturb=perturb,
+        log_density=log_density,
     )
 
 
 def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -> Exploration:
     """With probability epsilon a uniform random action, held for `hold` steps; else mu(s).
 
-    The density is conditional on the state: epsilon / volume where a random action begins, 1 (a
-    mass) while it is held, 1 - epsilon (a mass at mu(s)) where the action is greedy. So the
-    densities of a trajectory's steps multiply to the trajectory's.
+    Whether mu(s) is taken as it is or with clipped Gaussian noise is `hparams.noise`. The density
+    recorded of an action just drawn is `densities.epsilon_greedy`: inf for mu(s) without noise. Of
+    a held action it is 1 / volume, its own draw's, given that one is held: that the state has come
+    of it is neglected, bounds where noise has atoms are out of its reach, and these densities do
+    not multiply to a trajectory's, to which a held action adds a factor of one.
+
+    The marginal density has the random actions' share of the steps in the place of epsilon. It is
+    exact for `hold` 1; for more it neglects the same and is of the share in the long run.
     """
     hparams = hparams or EpsilonGreedyHParams()
-    log_volume = float(jnp.sum(jnp.log(2.0 * _half_width(spec))))
 
     def init(key: jax.Array) -> HeldActionState:
         del key
         return HeldActionState(jnp.zeros(spec.action_dim), jnp.zeros(()), _traced(hparams))
 
-    def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        choice_key, action_key = jax.random.split(key)
+    def draw(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+        keys = jax.random.split(key, 2 if hparams.noise is None else 3)
+        choice = jax.random.uniform(keys[0])
         random_action = jax.random.uniform(
-            action_key, (spec.action_dim,), minval=spec.action_low, maxval=spec.action_high
+            keys[1], (spec.action_dim,), minval=spec.action_low, maxval=spec.action_high
         )
-        return jax.random.uniform(choice_key), random_action
+        if hparams.noise is None:
+            return choice, random_action, None
+        # A float may fall on a bound, where it would be weighed as one of the noise's atoms.
+        low, high = spec.action_low, spec.action_high
+        margin = np.finfo(np.float32).eps * np.maximum(np.abs(low), np.abs(high))
+        random_action = jnp.clip(random_action, low + margin, high - margin)
+        return choice, random_action, jax.random.normal(keys[2], (spec.action_dim,))
 
     def perturb(
         state: HeldActionState,
         action: jax.Array,
-        noise: tuple[jax.Array, jax.Array],
+        noise: tuple[jax.Array, jax.Array, Any],
         step: Numeric,
     ):
-        choice, random_action = noise
-        epsilon = _epsilon(state.hparams, step)
+        choice, random_action, normal = noise
+        epsilon, scale = _epsilon(state.hparams, step), noise_scale(state)
+        noisy = action if scale is None else _clip(spec, action + scale * normal)
         held = state.remaining > 0
         begins = ~held & (choice < epsilon)
-        chosen = jnp.where(held, state.action, jnp.where(begins, random_action, action))
+        chosen = jnp.where(held, state.action, jnp.where(begins, random_action, noisy))
         log_density = jnp.where(
             held,
-            0.0,
-            jnp.where(begins, jnp.log(epsilon) - log_volume, jnp.log1p(-epsilon)),
+            -densities.log_volume(spec),
+            densities.epsilon_greedy(spec, epsilon, action, chosen, scale),
         )
         remaining = jnp.where(begins, state.hparams.hold - 1.0, state.remaining - 1.0)
         state = state.replace(action=chosen, remaining=jnp.maximum(remaining, 0.0))
         return chosen, log_density, state
+
+    def log_density(state: HeldActionState, greedy: jax.Array, action: jax.Array, step: Numeric):
+        epsilon, steps = _epsilon(state.hparams, step), jnp.ceil(state.hparams.hold)
+        share = epsilon * steps / (1.0 + epsilon * (steps - 1.0))
+        return densities.epsilon_greedy(spec, share, greedy, action, noise_scale(state))
+
+    def noise_scale(state: HeldActionState) -> jax.Array | None:
+        noise = state.hparams.noise
+        return None if noise is None else noise * _half_width(spec)
 
     return _exploration(
         init=init,
         reset=lambda state: state.replace(remaining=jnp.zeros_like(state.remaining)),
         draw=draw,
         perturb=perturb,
+        log_density=log_density,
     )
 
 
@@ -199,17 +249,8 @@ def _half_width(spec: EnvSpec) -> jax.Array:
     return 0.5 * jnp.asarray(spec.action_high - spec.action_low)
 
 
-def _clipped_normal(
-    spec: EnvSpec, mean: jax.Array, scale: jax.Array, noise: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """clip(mean + scale * noise) `[A]` and its log density `[]`, tail masses at the bounds."""
-    low, high = jnp.asarray(spec.action_low), jnp.asarray(spec.action_high)
-    action = jnp.clip(mean + scale * noise, low, high)
-    inside = -0.5 * jnp.square((action - mean) / scale) - jnp.log(scale * math.sqrt(2 * math.pi))
-    at_low = jax.scipy.stats.norm.logcdf((low - mean) / scale)
-    at_high = jax.scipy.stats.norm.logcdf((mean - high) / scale)
-    log_density = jnp.where(action <= low, at_low, jnp.where(action >= high, at_high, inside))
-    return action, jnp.sum(log_density, axis=-1)
+def _clip(spec: EnvSpec, action: jax.Array) -> jax.Array:
+    return jnp.clip(action, spec.action_low, spec.action_high)
 
 
 def _exploration(
@@ -217,8 +258,9 @@ def _exploration(
     reset: Callable[[Any], Any],
     draw: Callable[[jax.Array], Any],
     perturb: PerturbFn,
+    log_density: Callable[[Any, jax.Array, jax.Array, Numeric], jax.Array],
 ) -> Exploration:
     def sample(key: jax.Array, state: Any, action: jax.Array, step: Numeric):
         return perturb(state, action, draw(key), step)
 
-    return Exploration(init, reset, sample, draw, perturb)
+    return Exploration(init, reset, sample, draw, perturb, log_density)

@@ -1,4 +1,6 @@
-"""Independent float64 references: perceptrons in numpy, gradients by central differences."""
+"""Independent float64 references: perceptrons, gradients by differences, integrals over actions."""
+
+import itertools
 
 import jax
 import numpy as np
@@ -40,3 +42,15 @@ def gradient(loss, params, step=1e-6):
             slopes[position] = rise / (2 * step)
         found.append(slopes)
     return jax.tree.unflatten(structure, found)
+
+
+def base_measure(spec, n=200, *, atoms=True):
+    """Actions `[M, A]` and weights `[M]` of the integral over the bounds (and a mass at each)."""
+    node, weight = np.polynomial.legendre.leggauss(n)
+    axes = []
+    for low, high in np.float64(np.stack([spec.action_low, spec.action_high], axis=-1)):
+        half_width = 0.5 * (high - low)
+        axis = list(zip(low + half_width * (node + 1), half_width * weight, strict=True))
+        axes.append(axis + [(low, 1.0), (high, 1.0)] * atoms)
+    points = np.array(list(itertools.product(*axes)))  # [M, A, 2]
+    return points[..., 0], points[..., 1].prod(axis=-1)

@@ -15,6 +15,7 @@ from cmedirl_jax.exploration import (
     GaussianHParams,
     OrnsteinUhlenbeckHParams,
 )
+from tests import reference
 
 SPEC = envs.make("MountainCarContinuous-v0").spec._replace(
     action_low=np.array([-1.0], np.float32), action_high=np.array([3.0], np.float32)
@@ -124,6 +125,15 @@ def test_ornstein_uhlenbeck_has_the_closed_form_variance_and_autocorrelation():
         assert correlation == pytest.approx(decay**lag, abs=0.02)
 
 
+def test_ornstein_uhlenbecks_marginal_density_is_of_the_stationary_law():
+    behaviour = exploration.ornstein_uhlenbeck(SPEC)
+    action = np.float32([[LOW], [0.3], [2.0], [HIGH]])
+    found = behaviour.log_density(behaviour.init(KEY), jnp.float32([0.5]), action, 0)
+    law = scipy.stats.norm(0.5, 0.5 * HALF_WIDTH / np.sqrt(1 - 0.85**2))
+    expected = [law.logcdf(LOW), *law.logpdf(action[1:3, 0]), law.logsf(HIGH)]
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
 def test_ornstein_uhlenbeck_filters_its_noise():
     behaviour = exploration.ornstein_uhlenbeck(SPEC)
     noise = np.asarray(jax.random.normal(KEY, (50, 1)))
@@ -152,7 +162,7 @@ SCHEDULE = [(0, 1.0), (1250, 0.7525), (2500, 0.505), (5000, 0.01), (12_000, 0.01
 def test_epsilon_falls_linearly_and_stays(step, epsilon):
     behaviour = exploration.epsilon_greedy(SPEC)
     choices = (np.arange(10_000) + 0.5) / 10_000
-    noise = (choices.astype(np.float32), np.full((10_000, 1), 2.5, np.float32))
+    noise = (choices.astype(np.float32), np.full((10_000, 1), 2.5, np.float32), None)
     action, _, _ = jax.vmap(behaviour.perturb, in_axes=(None, None, 0, None))(
         behaviour.init(KEY), jnp.zeros(1), noise, step
     )
@@ -162,12 +172,12 @@ def test_epsilon_falls_linearly_and_stays(step, epsilon):
 @pytest.mark.parametrize(("step", "epsilon"), SCHEDULE)
 def test_epsilon_greedy_densities(step, epsilon):
     behaviour = exploration.epsilon_greedy(SPEC)
-    noise = (np.array([0.0, 1.0], np.float32), np.full((2, 1), 2.5, np.float32))
+    noise = (np.array([0.0, 1.0], np.float32), np.full((2, 1), 2.5, np.float32), None)
     action, log_density, _ = jax.vmap(behaviour.perturb, in_axes=(None, None, 0, None))(
         behaviour.init(KEY), jnp.zeros(1), noise, step
     )
     np.testing.assert_array_equal(action[:, 0], [2.5, 0.0])
-    expected = [epsilon / (HIGH - LOW), 1 - epsilon]
+    expected = [epsilon / (HIGH - LOW), np.inf]
     np.testing.assert_allclose(np.exp(log_density), expected, rtol=1e-5)
 
 
@@ -189,19 +199,53 @@ def test_random_actions_are_held_for_exactly_hold_steps(hold):
     actions, log_densities = [], []
     for offered in range(hold + 2):
         # Only the first choice is random: a held action must ignore those offered later.
-        noise = (jnp.float32(offered > 0), jnp.float32([2.0 + 0.01 * offered]))
+        noise = (jnp.float32(offered > 0), jnp.float32([2.0 + 0.01 * offered]), None)
         action, log_density, state = behaviour.perturb(state, jnp.zeros(1), noise, 2500)
         actions.append(float(action[0]))
         log_densities.append(float(log_density))
     assert actions == [2.0] * hold + [0.0] * 2
     log_volume = math.log(HIGH - LOW)
-    expected = [math.log(0.505) - log_volume] + [0.0] * (hold - 1) + [math.log(0.495)] * 2
+    expected = [math.log(0.505) - log_volume] + [-log_volume] * (hold - 1) + [math.inf] * 2
     np.testing.assert_allclose(log_densities, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("step", "epsilon"), SCHEDULE)
+@pytest.mark.parametrize("hold", [1, 4])
+def test_epsilon_greedys_marginal_density_is_of_the_random_actions_share(step, epsilon, hold):
+    behaviour = exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=hold))
+    action = np.float32([[0.3], [2.0]])
+    found = behaviour.log_density(behaviour.init(KEY), action[:1], action, step)
+    # Of many choices, the random ones last for `hold` steps each.
+    share = hold * epsilon / (hold * epsilon + 1 - epsilon)
+    np.testing.assert_allclose(np.exp(found), [np.inf, share / (HIGH - LOW)], rtol=1e-5)
+
+
+def test_the_noise_of_epsilon_greedy_is_on_the_greedy_action():
+    behaviour = exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(epsilon_end=0.2, noise=0.3))
+    drawn = (
+        np.float32([0.1, 0.5, 0.5, 0.5]),
+        np.float32([[2.5]] * 4),
+        np.float32([[9, 0, 1, 9]]).T,
+    )
+    action, log_density, _ = jax.vmap(behaviour.perturb, in_axes=(None, None, 0, None))(
+        behaviour.init(KEY), jnp.float32([0.5]), drawn, 5000
+    )
+    np.testing.assert_allclose(action[:, 0], [2.5, 0.5, 1.1, HIGH], rtol=1e-6)
+    law = scipy.stats.norm(0.5, 0.6)
+    expected = 0.8 * np.append(law.pdf(action[:3, 0]), law.sf(HIGH)) + 0.05 * (action[:, 0] < HIGH)
+    np.testing.assert_allclose(np.exp(log_density), expected, rtol=1e-4)
+
+
+def test_noise_leaves_the_choices_and_the_random_actions_as_they_are():
+    plain = exploration.epsilon_greedy(SPEC).draw(KEY)
+    noisy = exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(noise=0.3)).draw(KEY)
+    assert plain[2] is None
+    assert (plain[0], plain[1]) == (noisy[0], noisy[1])
 
 
 def test_an_episode_does_not_inherit_a_held_action():
     behaviour = exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=5.0))
-    begin, decline = (jnp.float32(0.0), jnp.ones(1)), (jnp.float32(1.0), jnp.ones(1))
+    begin, decline = (jnp.float32(0.0), jnp.ones(1), None), (jnp.float32(1.0), jnp.ones(1), None)
     _, _, state = behaviour.perturb(behaviour.init(KEY), jnp.zeros(1), begin, 2500)
     action, _, _ = behaviour.perturb(behaviour.reset(state), jnp.zeros(1), decline, 2500)
     assert action == 0.0
@@ -211,9 +255,12 @@ BEHAVIOURS = [
     exploration.gaussian(SPEC, GaussianHParams(scale=2.0)),
     exploration.ornstein_uhlenbeck(SPEC, OrnsteinUhlenbeckHParams(sigma=2.0)),
     exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=2.0)),
+    exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=2.0, noise=0.5)),
 ]
 JITTED = [jax.jit(behaviour.sample) for behaviour in BEHAVIOURS]
-kinds = pytest.mark.parametrize("kind", range(3), ids=["gaussian", "ou", "epsilon_greedy"])
+kinds = pytest.mark.parametrize(
+    "kind", range(4), ids=["gaussian", "ou", "epsilon_greedy", "noisy_epsilon_greedy"]
+)
 
 
 @kinds
@@ -222,12 +269,12 @@ kinds = pytest.mark.parametrize("kind", range(3), ids=["gaussian", "ou", "epsilo
     mu=st.floats(float(LOW), float(HIGH), width=32),
     step=st.integers(0, 20_000),
 )
-def test_actions_stay_in_bounds_with_finite_density(kind, seed, mu, step):
+def test_actions_stay_in_bounds_with_a_density_infinite_at_an_atom_alone(kind, seed, mu, step):
     state = BEHAVIOURS[kind].init(KEY)
     for key in jax.random.split(jax.random.key(seed), 3):
         action, log_density, state = JITTED[kind](key, state, jnp.float32([mu]), step)
         assert LOW <= action <= HIGH
-        assert jnp.isfinite(log_density)
+        assert jnp.isfinite(log_density) or (kind == 2 and log_density > 0 and action == mu)
 
 
 @kinds
@@ -250,3 +297,78 @@ def test_hyperparameters_can_be_vmapped_over():
         states, jnp.zeros(1), jnp.float32([0.7]), 0
     )
     np.testing.assert_allclose(action[:, 0], 0.7 * HALF_WIDTH * sigmas, rtol=1e-6)
+
+
+MU, STEP, SHARE = 0.8, 2500, 0.505
+"""The greedy action, and a step with its epsilon, of the estimates of Z."""
+
+
+def reward(action):
+    return np.sin(2.0 * action) - 0.3 * np.square(action - 0.5)
+
+
+def integral(*, atoms):
+    action, weight = reference.base_measure(SPEC, atoms=atoms)
+    return float(weight @ np.exp(reward(action[:, 0])))
+
+
+INSIDE, WITH_BOUNDS = integral(atoms=False), integral(atoms=True)
+HELD = 2 * SHARE / (1 + 2 * SHARE)
+"""The share of the steps at which an action that lasts three is being held."""
+ESTIMATES = {
+    # The behaviour, what its recorded densities estimate and what its marginal ones do.
+    "gaussian": (
+        exploration.gaussian(SPEC, GaussianHParams(scale=0.6)),
+        WITH_BOUNDS,
+        WITH_BOUNDS,
+    ),
+    "ornstein_uhlenbeck": (
+        exploration.ornstein_uhlenbeck(SPEC, OrnsteinUhlenbeckHParams(theta=0.5, sigma=1.0)),
+        WITH_BOUNDS,
+        WITH_BOUNDS,
+    ),
+    "epsilon_greedy": (exploration.epsilon_greedy(SPEC), INSIDE, INSIDE),
+    "noisy_epsilon_greedy": (
+        exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(noise=0.5)),
+        WITH_BOUNDS,
+        WITH_BOUNDS,
+    ),
+    "held_epsilon_greedy": (
+        exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=3.0)),
+        INSIDE,
+        INSIDE,
+    ),
+    # No held action is at a bound, so those steps miss the bounds' share.
+    "noisy_held_epsilon_greedy": (
+        exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=3.0, noise=0.5)),
+        HELD * INSIDE + (1 - HELD) * WITH_BOUNDS,
+        WITH_BOUNDS,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ESTIMATES)
+def test_actions_weighted_by_their_densities_estimate_the_partition_function(name):
+    behaviour, *expected = ESTIMATES[name]
+
+    @jax.jit
+    @jax.vmap
+    def run(key):
+        def advance(state, key):
+            action, recorded, state = behaviour.sample(key, state, jnp.float32([MU]), STEP)
+            return state, (action, recorded)
+
+        state, (action, recorded) = jax.lax.scan(
+            advance, behaviour.init(key), jax.random.split(key, 40)
+        )
+        # By then the noise's state has forgotten how it began.
+        marginal = behaviour.log_density(state, jnp.float32([MU]), action[20:], STEP)
+        return action[20:, 0], recorded[20:], marginal
+
+    action, *log_densities = jax.tree.map(np.float64, run(jax.random.split(KEY, 8000)))
+    for log_density, value in zip(log_densities, expected, strict=True):
+        # The steps of a lane depend on each other, the lanes do not.
+        estimates = np.exp(reward(action) - log_density).mean(axis=1)
+        error = estimates.std() / len(estimates) ** 0.5
+        assert error < 0.02 * value
+        assert abs(estimates.mean() - value) < 4 * error
