@@ -28,7 +28,7 @@ class Method(NamedTuple):
         name: as the command line and the tables write it.
         description: in a line.
         hot_start: whether actor and critic start from the demonstrations (Eq. 11). With
-            `schedule.behaviour_cloning_steps` the actor also goes on imitating them for a while.
+            `schedule.cloning` the actor also goes on imitating them, for a while or throughout.
         learned_reward: whether r_D is learned (Algorithm 1) and added to r_e (Eq. 10).
         tabular_reward: maximum-entropy IRL by dynamic programming on a grid of the environment
             (Eqs. 6-9), with a "linear" or a "deep" reward, or None. That reward is r_D, frozen.

@@ -47,9 +47,11 @@ class Schedule:
     """Environment steps between updates of actor and critic."""
     target_period: int = 1
     """Environment steps between target updates (the paper: 300, with agent.tau 1)."""
-    behaviour_cloning_steps: int | None = 4000
-    """Environment steps over which agent.behaviour_cloning of a hot-started method falls linearly
-    to 0; None: no such term."""
+    cloning: Literal["none", "constant", "annealed"] = "annealed"
+    """How agent.behaviour_cloning of a hot-started method goes on: left out, at its full weight, or
+    falling linearly to 0."""
+    behaviour_cloning_steps: int = 4000
+    """Environment steps over which "annealed" cloning falls."""
 
 
 class Plan(NamedTuple):
@@ -88,10 +90,18 @@ def plan(step: jax.Array, schedule: Schedule, reward_schedule: RewardSchedule) -
         update_targets=step % schedule.target_period < schedule.update_period,
         learn_reward=learn_reward,
         reward_weight=reward_weight,
-        cloning_weight=jnp.zeros_like(step, jnp.float32)
-        if schedule.behaviour_cloning_steps is None
-        else _falling(step, schedule.behaviour_cloning_steps),
+        cloning_weight=_cloning_weight(step, schedule),
     )
+
+
+def _cloning_weight(step: jax.Array, schedule: Schedule) -> jax.Array:
+    match schedule.cloning:
+        case "none":
+            return jnp.zeros_like(step, jnp.float32)
+        case "constant":
+            return jnp.ones_like(step, jnp.float32)
+        case "annealed":
+            return _falling(step, schedule.behaviour_cloning_steps)
 
 
 def _falling(step: jax.Array, steps: int) -> jax.Array:

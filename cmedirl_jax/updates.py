@@ -54,7 +54,8 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
     """Make the updates of a method from its parts."""
     agent, learner, _, replay = algorithm
     schedule = settings.reward_schedule
-    clones = method.hot_start and settings.schedule.behaviour_cloning_steps is not None
+    cloning = settings.schedule.cloning
+    clones = method.hot_start and cloning != "none"
     stores_shaped = learner is not None and schedule.storage == "store"
     reward_batch = schedule.iterations * schedule.batch_size
     agent_batch = settings.schedule.batch_size
@@ -113,7 +114,7 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
             batch,
             _rows(pool, draws.demonstrations[:agent_batch]),
             update_targets=update_targets,
-            clone=plan.cloning_weight > 0,
+            clone=True if cloning == "constant" else plan.cloning_weight > 0,
         )
         return agent_state.replace(hparams=hparams), info
 

@@ -60,6 +60,7 @@ def test_paper_is_the_papers_letter():
     assert settings.reward_schedule.period == 1
     assert math.isinf(settings.reward.bound)
     assert settings.hot_start.critic == "softmax"
+    assert settings.schedule.cloning == "none"
     assert grid.seeds == 100
     assert (grid.evaluate_every_episodes, grid.evaluation_starts_episodes) == (100, 100)
     assert grid.max_steps is None

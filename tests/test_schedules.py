@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from cmedirl_jax import schedules
 from cmedirl_jax.schedules import RewardSchedule, Schedule
@@ -36,3 +37,9 @@ def test_weights_fall_linearly_to_zero_and_stay_there():
     steps = np.arange(60)
     np.testing.assert_allclose(found.cloning_weight, np.clip(1 - steps / 50, 0, 1), atol=1e-6)
     np.testing.assert_allclose(found.reward_weight, np.clip(1 - steps / 20, 0, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize(("cloning", "weight"), [("none", 0.0), ("constant", 1.0)])
+def test_cloning_that_does_not_fade(cloning, weight):
+    found = plans(Schedule(cloning=cloning, behaviour_cloning_steps=50))
+    np.testing.assert_array_equal(found.cloning_weight, np.full(60, weight))

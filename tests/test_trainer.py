@@ -201,12 +201,10 @@ def test_the_learned_reward_reaches_the_critic():
     assert any((a != b).any() for a, b in pairs)
 
 
-def test_the_behaviour_cloning_term_fades_out():
-    faded = with_(agent={"behaviour_cloning": 5.0}, schedule={"behaviour_cloning_steps": 1})
-    cloning = with_(agent={"behaviour_cloning": 5.0})
-    without = with_(schedule={"behaviour_cloning_steps": None})
+def test_the_behaviour_cloning_term_fades_out_or_stays():
     actors = []
-    for settings in (faded, without, cloning):
+    for schedule in ({"behaviour_cloning_steps": 1}, {"cloning": "none"}, {"cloning": "constant"}):
+        settings = with_(agent={"behaviour_cloning": 5.0}, schedule=schedule)
         _, state, advance = start("hs-ddpg", settings)
         actors.append(advance(state, 0, 40)[0].agent.actor)
     chex.assert_trees_all_close(actors[0], actors[1], rtol=1e-3, atol=1e-5)
