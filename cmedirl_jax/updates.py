@@ -59,8 +59,9 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
     stores_shaped = learner is not None and schedule.storage == "store"
     reward_batch = schedule.iterations * schedule.batch_size
     agent_batch = settings.schedule.batch_size
-    # A constant, so that no branch is compiled: branches copy what passes through them.
+    # Constants, so that no branch is compiled: branches copy what passes through them.
     always_moves_targets = settings.schedule.target_period <= settings.schedule.update_period
+    freezes_actor = method.hot_start and settings.schedule.frozen_actor_steps > 0
 
     def draw(key: jax.Array, subset: DemonstrationSubset | None) -> Draws:
         batch_key, background_key, demonstrations_key = jax.random.split(key, 3)
@@ -104,15 +105,19 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
         batch = replay.take(replay_state, draws.batch)
         if not stores_shaped:
             batch = shape(reward_state, batch, plan)
+        update_actor = plan.update_actor if freezes_actor else True
         update_targets = True if always_moves_targets else plan.update_targets
         if not clones:
-            return agent.update(agent_state, batch, update_targets=update_targets)
+            return agent.update(
+                agent_state, batch, update_actor=update_actor, update_targets=update_targets
+            )
         hparams = agent_state.hparams
         faded = hparams.replace(behaviour_cloning=hparams.behaviour_cloning * plan.cloning_weight)
         agent_state, info = agent.update(
             agent_state.replace(hparams=faded),
             batch,
             _rows(pool, draws.demonstrations[:agent_batch]),
+            update_actor=update_actor,
             update_targets=update_targets,
             clone=True if cloning == "constant" else plan.cloning_weight > 0,
         )

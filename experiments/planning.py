@@ -74,6 +74,9 @@ def check(grid: Grid) -> None:
     for name, value in _positive(grid):
         if value is not None and value < 1:
             raise UserError(f"--{name.replace('_', '-')}: must be at least 1, got {value}")
+    frozen = grid.settings.schedule.frozen_actor_steps
+    if frozen < 0:
+        raise UserError(f"--schedule.frozen-actor-steps: must be at least 0, got {frozen}")
     try:
         networks.make(env.spec, grid.settings.architecture)
     except ValueError as error:

@@ -15,11 +15,12 @@ def plans(schedule=None, reward=None, steps=60):
 
 def test_predicates_by_counting():
     found = plans(
-        Schedule(learning_starts=10, update_period=3, target_period=7),
+        Schedule(learning_starts=10, update_period=3, target_period=7, frozen_actor_steps=25),
         RewardSchedule(period=4, stop=30),
     )
     steps = range(60)
     assert np.flatnonzero(found.learn).tolist() == [t for t in steps if t >= 10 and t % 3 == 0]
+    assert np.flatnonzero(found.update_actor).tolist() == [t for t in steps if t >= 25]
     # Targets move with the first update at or after each multiple of their period.
     moved = np.flatnonzero(found.learn & found.update_targets).tolist()
     assert moved == [t for t in range(12, 60, 3) if any(u % 7 == 0 for u in range(t - 2, t + 1))]

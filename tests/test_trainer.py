@@ -212,6 +212,31 @@ def test_the_behaviour_cloning_term_fades_out_or_stays():
     assert any(np.abs(a - b).max() > 1e-4 for a, b in pairs)
 
 
+def test_a_hot_started_actor_can_be_frozen_while_the_critic_learns():
+    _, before, advance = start("hs-ddpg", with_(schedule={"frozen_actor_steps": 25}))
+    frozen, log = advance(before, 0, 25)
+    assert log.learned[10:].all()
+    chex.assert_trees_all_equal(frozen.agent.actor, before.agent.actor)
+    after, _ = advance(frozen, 25, 50)
+
+    def moved(old, new):
+        return all((a != b).any() for a, b in zip(*map(jax.tree.leaves, (old, new)), strict=True))
+
+    assert moved(before.agent.critic, frozen.agent.critic)
+    assert moved(frozen.agent.actor, after.agent.actor)
+
+
+def test_only_a_frozen_actor_compiles_a_branch():
+    def branches(method, frozen_actor_steps):
+        settings = with_(schedule={"frozen_actor_steps": frozen_actor_steps})
+        trainer = training.make(ENV, METHODS[method], settings, capacity=400)
+        state = jax.eval_shape(lambda key: trainer.init(key, data(), 3), jax.random.key(0))
+        return str(jax.make_jaxpr(trainer.run)(state, data(), jnp.arange(5))).count("cond[")
+
+    assert branches("ddpg", 25) == branches("ddpg", 0)
+    assert branches("hs-ddpg", 25) == branches("hs-ddpg", 0) + 1
+
+
 def test_targets_are_copied_every_period():
     settings = with_(agent={"tau": 1.0}, schedule={"target_period": 7})
     _, state, advance = start("ddpg", settings)
