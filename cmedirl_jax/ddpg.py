@@ -38,8 +38,7 @@ class DDPGHParams(flax.struct.PyTreeNode):
     """Weight of the actor's squared error on the demonstrations passed to `update`; the `tuned`
     preset sets 1."""
     q_filter: bool = flax.struct.field(pytree_node=False, default=False)
-    """Clone only the demonstrated actions that the critic values above the actor's own (Nair et al.
-    2018)."""
+    """Clone only the actions that the critic values above the actor's own (Nair et al. 2018)."""
     bootstrap_at_termination: bool = flax.struct.field(pytree_node=False, default=False)
     """Leave (1 - terminated) out of the target, as Algorithm 2 is printed."""
 

@@ -85,6 +85,8 @@ class ExplorationSettings:
 
     kind: Literal["ornstein-uhlenbeck", "gaussian", "epsilon-greedy"] = "ornstein-uhlenbeck"
     """Which noise; the options of the others are ignored."""
+    hot_start_factor: float = 1.0
+    """Factor on the noise of a hot-started method: on sigma, on the scale, or on both epsilons."""
     ornstein_uhlenbeck: OrnsteinUhlenbeckHParams = OrnsteinUhlenbeckHParams()
     gaussian: GaussianHParams = GaussianHParams()
     epsilon_greedy: EpsilonGreedyHParams = EpsilonGreedyHParams()
@@ -131,17 +133,26 @@ def compose(spec: EnvSpec, method: Method, settings: Settings, capacity: int) ->
     return Algorithm(
         agent=ddpg.make(spec, settings.agent, networks=networks.make(spec, settings.architecture)),
         learner=learner,
-        exploration=make_exploration(spec, settings.exploration),
+        exploration=make_exploration(spec, settings.exploration, hot_start=method.hot_start),
         replay=replay.make(spec, settings.schedule.replay_capacity or capacity),
     )
 
 
-def make_exploration(spec: EnvSpec, settings: ExplorationSettings) -> Exploration:
-    """The behaviour policy that `settings.kind` names."""
+def make_exploration(
+    spec: EnvSpec, settings: ExplorationSettings, *, hot_start: bool = False
+) -> Exploration:
+    """The behaviour policy that `settings.kind` names, for a hot-started method or another."""
+    factor = settings.hot_start_factor if hot_start else 1.0
     match settings.kind:
         case "ornstein-uhlenbeck":
-            return exploration.ornstein_uhlenbeck(spec, settings.ornstein_uhlenbeck)
+            noise = settings.ornstein_uhlenbeck
+            return exploration.ornstein_uhlenbeck(spec, noise.replace(sigma=factor * noise.sigma))
         case "gaussian":
-            return exploration.gaussian(spec, settings.gaussian)
+            noise = settings.gaussian
+            return exploration.gaussian(spec, noise.replace(scale=factor * noise.scale))
         case "epsilon-greedy":
-            return exploration.epsilon_greedy(spec, settings.epsilon_greedy)
+            noise = settings.epsilon_greedy
+            scaled = noise.replace(
+                epsilon_start=factor * noise.epsilon_start, epsilon_end=factor * noise.epsilon_end
+            )
+            return exploration.epsilon_greedy(spec, scaled)
