@@ -37,6 +37,8 @@ class DDPGHParams(flax.struct.PyTreeNode):
     behaviour_cloning: float = 0.0
     """Weight of the actor's squared error on the demonstrations passed to `update`; the `tuned`
     preset sets 1."""
+    q_filter: bool = flax.struct.field(pytree_node=False, default=False)
+    """Clone only the actions that the critic values above the actor's own (Nair et al. 2018)."""
     bootstrap_at_termination: bool = flax.struct.field(pytree_node=False, default=False)
     """Leave (1 - terminated) out of the target, as Algorithm 2 is printed."""
 
@@ -191,7 +193,7 @@ def make(
             cloning_loss, cloning_grads = _when(
                 clone,
                 lambda actor: jax.value_and_grad(behaviour_cloning_loss, argnums=1)(
-                    networks, actor, state.hparams, demonstrations
+                    networks, actor, state.critic, state.hparams, demonstrations
                 ),
                 lambda actor: (jnp.zeros(()), jax.tree.map(jnp.zeros_like, actor)),
                 actor,
@@ -266,13 +268,25 @@ def actor_loss(
 
 
 def behaviour_cloning_loss(
-    networks: ActorCritic, actor: Params, hparams: DDPGHParams, demonstrations: Transition
+    networks: ActorCritic,
+    actor: Params,
+    critic: Params,
+    hparams: DDPGHParams,
+    demonstrations: Transition,
 ) -> jax.Array:
-    """w 1/D sum_i |mu(s_i) - a_i|^2 on demonstrations `[D, ...]`, added to the actor's loss."""
+    """w 1/D sum_i |mu(s_i) - a_i|^2 on demonstrations `[D, ...]`, added to the actor's loss.
+
+    With `hparams.q_filter`, each term times 1{Q(s_i, a_i) > Q(s_i, mu(s_i))} (Nair et al. 2018).
+    """
+    observation, action = demonstrations.observation, demonstrations.action
+    counts = None
+    if hparams.q_filter:
+        # A comparison: no gradient passes.
+        counts = networks.critic.apply(critic, observation, action) > networks.critic.apply(
+            critic, observation, networks_lib.policy(networks, actor, observation)
+        )
     # The running statistics are the replay batch's alone to move.
-    error, _ = networks_lib.imitation_error(
-        networks, actor, demonstrations.observation, demonstrations.action
-    )
+    error, _ = networks_lib.imitation_error(networks, actor, observation, action, counts)
     return hparams.behaviour_cloning * error
 
 

@@ -3,13 +3,16 @@
 The actor is regressed on the demonstrated actions. The critic is a 'DAQN': its values at `cells`
 evenly spaced actions are pushed towards a target that singles out the demonstrated one. What the
 paper writes (a softmax over actions, a squared error to a one-hot array) fits no continuous critic
-as it stands; the three readings are the values of `HotStartHParams.critic`:
+as it stands; the readings, and two losses in its place, are the values of `HotStartHParams.critic`:
 
 - "softmax" (H0, the letter): sum_k [softmax(Q(s, a_1..K))_k - 1{k = demonstrated cell}]^2
 - "one-hot" (H1): sum_k [Q(s, a_k) - 1{k = demonstrated cell}]^2, where the demonstrated action
   itself replaces the cell nearest to it
 - "quadratic" (H2): sum_k [Q(s, a_k) - (G(s) - curvature |a_k - a_demo|^2)]^2, with G the discounted
   return that the demonstration went on to receive: values on the scale of returns
+- "monte-carlo" (H3): [Q(s, a_demo) - G(s)]^2, on the demonstrated action alone
+- "large-margin" (H4, as in DQfD, Hester et al. 2018): max_k [Q(s, a_k) + margin 1{k != demonstrated
+  cell}] - Q(s, a_demo), at the actions of "one-hot"; it leaves the level of Q free
 """
 
 from typing import Any, Literal, NamedTuple
@@ -34,10 +37,12 @@ class HotStartHParams(flax.struct.PyTreeNode):
     """Adam's rate for both networks."""
     curvature: float = 20.0
     """Of the "quadratic" critic target, per squared half-width of the action range."""
-    critic: Literal["softmax", "one-hot", "quadratic"] = flax.struct.field(
-        pytree_node=False, default="one-hot"
+    margin: float = 0.8
+    """Of the "large-margin" loss: by how much the demonstrated action's value is to lead."""
+    critic: Literal["softmax", "one-hot", "quadratic", "monte-carlo", "large-margin"] = (
+        flax.struct.field(pytree_node=False, default="one-hot")
     )
-    """The critic's loss: H0, H1 or H2, see the module's docstring."""
+    """The critic's loss: H0 to H4, see the module's docstring."""
     cells: int = flax.struct.field(pytree_node=False, default=11)
     """Evenly spaced values per action dimension, bounds included; K = cells^A actions."""
     steps: int = flax.struct.field(pytree_node=False, default=1000)
@@ -141,16 +146,20 @@ def critic_loss(
     action: jax.Array,
     discounted_return: jax.Array,
 ) -> tuple[jax.Array, Params]:
-    """Eq. 11 in the reading that `hparams.critic` names, averaged over the batch, and the params.
+    """Eq. 11 as `hparams.critic` reads or replaces it, averaged over the batch, and the params.
 
     Args:
         networks: whose critic.
         critic: its parameters.
-        hparams: which reading, how many cells.
+        hparams: which loss, how many cells, the curvature, the margin.
         observation: `[B, O]`.
         action: `[B, A]`, demonstrated.
-        discounted_return: `[B]`, read by "quadratic" alone.
+        discounted_return: `[B]`, read by "quadratic" and "monte-carlo" alone.
     """
+    evaluate = networks_lib.train_mode(networks.critic)
+    if hparams.critic == "monte-carlo":
+        q, critic = evaluate(critic, observation, action)
+        return jnp.mean(jnp.square(q - discounted_return)), critic
     spec = networks.spec
     half_width = 0.5 * (spec.action_high - spec.action_low)
     cells = jnp.asarray(action_cells(spec, hparams.cells))
@@ -159,19 +168,29 @@ def critic_loss(
     )  # [B, K]
     nearest = jax.nn.one_hot(jnp.argmin(squared_distance, axis=-1), len(cells))
     actions = jnp.broadcast_to(cells, (*squared_distance.shape, spec.action_dim))
-    if hparams.critic == "one-hot":
+    if hparams.critic in ("one-hot", "large-margin"):
         actions = jnp.where(nearest[..., None] > 0, action[:, None, :], actions)
     observations = jnp.broadcast_to(
         observation[:, None, :], (*squared_distance.shape, spec.observation_dim)
     )
-    q, critic = networks_lib.train_mode(networks.critic)(critic, observations, actions)
-    if hparams.critic == "quadratic":
-        target = discounted_return[:, None] - hparams.curvature * squared_distance
-    else:
-        target = nearest
-    if hparams.critic == "softmax":
-        q = jax.nn.softmax(q, axis=-1)
-    return jnp.mean(jnp.sum(jnp.square(q - target), axis=-1)), critic
+    q, critic = evaluate(critic, observations, actions)
+    match hparams.critic:
+        case "softmax":
+            error = _squared_error(jax.nn.softmax(q, axis=-1), nearest)
+        case "one-hot":
+            error = _squared_error(q, nearest)
+        case "quadratic":
+            target = discounted_return[:, None] - hparams.curvature * squared_distance
+            error = _squared_error(q, target)
+        case "large-margin":
+            best = jnp.max(q + hparams.margin * (1.0 - nearest), axis=-1)
+            error = best - jnp.sum(nearest * q, axis=-1)
+    return jnp.mean(error), critic
+
+
+def _squared_error(q: jax.Array, target: jax.Array) -> jax.Array:
+    """Summed over the cells: `[B, K]` -> `[B]`."""
+    return jnp.sum(jnp.square(q - target), axis=-1)
 
 
 def action_cells(spec: EnvSpec, cells: int) -> np.ndarray:

@@ -10,12 +10,13 @@ import jax.numpy as jnp
 from cmedirl_jax import demonstrations as demonstrations_lib
 from cmedirl_jax import hot_start
 from cmedirl_jax.background import BackgroundState
+from cmedirl_jax.composition import Algorithm
 from cmedirl_jax.ddpg import DDPGState
 from cmedirl_jax.demonstrations import DemonstrationSubset
 from cmedirl_jax.envs import Env
 from cmedirl_jax.hot_start import HotStartData
 from cmedirl_jax.irl import RewardState
-from cmedirl_jax.methods import Algorithm, Method, Settings
+from cmedirl_jax.methods import Method, Settings
 from cmedirl_jax.tabular import frozen, imitation
 from cmedirl_jax.types import Numeric, Params
 

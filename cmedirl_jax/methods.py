@@ -3,24 +3,19 @@
 import dataclasses
 from typing import Literal, NamedTuple
 
-from cmedirl_jax import background, ddpg, exploration, irl, networks, replay, rewards
-from cmedirl_jax.background import Background
-from cmedirl_jax.ddpg import DDPG, DDPGHParams
+from cmedirl_jax.ddpg import DDPGHParams
 from cmedirl_jax.exploration import (
     EpsilonGreedyHParams,
-    Exploration,
     GaussianHParams,
     OrnsteinUhlenbeckHParams,
 )
 from cmedirl_jax.hot_start import HotStartHParams
-from cmedirl_jax.irl import GAILHParams, IRLHParams, RewardLearner
+from cmedirl_jax.irl import GAILHParams, IRLHParams
 from cmedirl_jax.networks import Architecture
-from cmedirl_jax.replay import Replay
 from cmedirl_jax.schedules import RewardSchedule, Schedule
 from cmedirl_jax.shaping import Shaping
-from cmedirl_jax.tabular import frozen, imitation
+from cmedirl_jax.tabular import imitation
 from cmedirl_jax.tabular.imitation import TabularSettings
-from cmedirl_jax.types import EnvSpec, Network
 
 Reward = Literal[
     "maxent", "gail", "tabular-linear", "tabular-deep", "random", "plus-constant", "minus-constant"
@@ -34,7 +29,7 @@ class Method(NamedTuple):
         name: as the command line and the tables write it.
         description: in a line.
         hot_start: whether actor and critic start from the demonstrations (Eq. 11). With
-            `schedule.behaviour_cloning_steps` the actor also goes on imitating them for a while.
+            `schedule.cloning` the actor also goes on imitating them, for a while or throughout.
         reward: where r_D comes from, or None:
             "maxent", learned from samples (Algorithm 1); "gail", from a discriminator;
             "tabular-linear" and "tabular-deep", frozen, by dynamic programming on a grid of the
@@ -102,6 +97,8 @@ class ExplorationSettings:
 
     kind: Literal["ornstein-uhlenbeck", "gaussian", "epsilon-greedy"] = "ornstein-uhlenbeck"
     """Which noise; the options of the others are ignored."""
+    hot_start_factor: float = 1.0
+    """Factor on the noise of a hot-started method: on sigma, on the scale, or on both epsilons."""
     ornstein_uhlenbeck: OrnsteinUhlenbeckHParams = OrnsteinUhlenbeckHParams()
     gaussian: GaussianHParams = GaussianHParams()
     epsilon_greedy: EpsilonGreedyHParams = EpsilonGreedyHParams()
@@ -137,138 +134,3 @@ class Settings:
     hot_start: HotStartHParams = HotStartHParams()
     schedule: Schedule = Schedule()
     tabular: TabularSettings = TabularSettings()
-
-
-class Algorithm(NamedTuple):
-    """A method's parts, made for an environment.
-
-    Attributes:
-        agent: DDPG.
-        learner: of r_D, or None.
-        shaping: how r_D joins r_e.
-        exploration: the behaviour policy.
-        replay: the buffer.
-        background: what the learner of r_D samples, or None for one that does not learn.
-    """
-
-    agent: DDPG
-    learner: RewardLearner | None
-    shaping: Shaping
-    exploration: Exploration
-    replay: Replay
-    background: Background | None
-
-
-def compose(spec: EnvSpec, method: Method, settings: Settings, capacity: int) -> Algorithm:
-    """Make a method's parts; `capacity` is the replay's where the settings leave it open.
-
-    Raises:
-        ValueError: for parts that do not fit each other.
-    """
-    schedule, hparams = settings.reward_schedule, settings.reward
-    shaping = schedule.shaping or method.shaping
-    agent = ddpg.make(spec, settings.agent, networks=networks.make(spec, settings.architecture))
-    behaviour = make_exploration(spec, settings.exploration)
-    capacity = settings.schedule.replay_capacity or capacity
-    buffer = replay.make(spec, capacity)
-    samples = None
-    if method.learns_reward:
-        if method.reward == "maxent":
-            _check_weights(settings)
-        samples = background.make(
-            spec,
-            agent.networks,
-            behaviour,
-            buffer,
-            capacity,
-            # A discriminator is trained on the pairs as they come.
-            schedule
-            if method.reward == "maxent"
-            else dataclasses.replace(schedule, weights="uniform"),
-            objective=hparams.objective if method.reward == "maxent" else "visitation",
-            append=hparams.append_demonstrations,
-        )
-    if method.reward is not None and shaping == "potential":
-        _check_potential(method, settings)
-    return Algorithm(
-        agent=agent,
-        learner=make_learner(spec, method, settings, shaping),
-        shaping=shaping,
-        exploration=behaviour,
-        replay=buffer,
-        background=samples,
-    )
-
-
-def make_learner(
-    spec: EnvSpec, method: Method, settings: Settings, shaping: Shaping
-) -> RewardLearner | None:
-    """The learner of `method.reward`, or what stands in for one."""
-    hparams = settings.reward
-    network = reward_network(spec, settings.reward_network, state_only=shaping == "potential")
-    match method.reward:
-        case "maxent":
-            return irl.make(spec, hparams, network=network)
-        case "gail":
-            return irl.adversarial.make(spec, settings.gail, network=network)
-        case "tabular-linear" | "tabular-deep":
-            return frozen.make(*imitation.grids(spec, settings.tabular), hparams)
-        case "random":
-            return irl.controls.random(spec, hparams, network=network)
-        case "plus-constant":
-            return irl.controls.constant(hparams.bound)
-        case "minus-constant":
-            return irl.controls.constant(-hparams.bound)
-        case None:
-            return None
-
-
-def reward_network(
-    spec: EnvSpec, settings: RewardNetworkSettings, *, state_only: bool = False
-) -> Network:
-    """f(s, a) as the settings say; `state_only` for a potential, whatever they say."""
-    inputs = "state" if state_only else settings.inputs
-    match settings.kind:
-        case "deep":
-            return rewards.mlp(spec, settings.hidden, inputs)
-        case "radial-basis":
-            return rewards.linear(spec, rewards.radial_basis(spec, settings.centres, inputs))
-        case "fourier":
-            return rewards.linear(spec, rewards.fourier(spec, settings.order, inputs))
-
-
-def _check_weights(settings: Settings) -> None:
-    if settings.exploration.kind != "epsilon-greedy":
-        return
-    weights, epsilon_greedy = settings.reward_schedule.weights, settings.exploration.epsilon_greedy
-    whole = settings.reward.objective == "trajectory"
-    if weights != "uniform" and whole and epsilon_greedy.hold > 1:
-        raise ValueError(
-            "a trajectory of held random actions has no density to weight it by: take "
-            "reward_schedule.weights uniform, or exploration.epsilon_greedy.hold 1"
-        )
-    if epsilon_greedy.noise is None and (weights == "fusion" or (weights != "uniform" and whole)):
-        raise ValueError(
-            "a greedy action without noise has no density to weight it by: take "
-            "reward_schedule.weights uniform, or give exploration.epsilon_greedy.noise"
-        )
-
-
-def _check_potential(method: Method, settings: Settings) -> None:
-    if method.tabular is not None and settings.tabular.reward != "state":
-        raise ValueError(
-            f"a potential is a function of the state: {method.name} needs tabular.reward state"
-        )
-    if method.reward == "maxent" and settings.reward.absorbing:
-        raise ValueError("a potential is 0 past termination: it has no absorbing reward")
-
-
-def make_exploration(spec: EnvSpec, settings: ExplorationSettings) -> Exploration:
-    """The behaviour policy that `settings.kind` names."""
-    match settings.kind:
-        case "ornstein-uhlenbeck":
-            return exploration.ornstein_uhlenbeck(spec, settings.ornstein_uhlenbeck)
-        case "gaussian":
-            return exploration.gaussian(spec, settings.gaussian)
-        case "epsilon-greedy":
-            return exploration.epsilon_greedy(spec, settings.epsilon_greedy)

@@ -142,7 +142,11 @@ def policy(networks: ActorCritic, actor: Params, observation: jax.Array) -> jax.
 
 
 def imitation_error(
-    networks: ActorCritic, actor: Params, observation: jax.Array, action: jax.Array
+    networks: ActorCritic,
+    actor: Params,
+    observation: jax.Array,
+    action: jax.Array,
+    counts: jax.Array | None = None,
 ) -> tuple[jax.Array, Params]:
     """Mean squared error of mu(s) to demonstrated actions, in training mode, and the parameters.
 
@@ -151,9 +155,13 @@ def imitation_error(
         actor: its parameters.
         observation: `[B, O]`.
         action: `[B, A]`.
+        counts: `[B]` bool; the others add zeros to a mean that stays over all. None: all count.
     """
     pre_activation, actor = train_mode(networks.actor)(actor, observation)
-    return jnp.mean(jnp.square(networks.squash(pre_activation) - action)), actor
+    squared = jnp.square(networks.squash(pre_activation) - action)
+    if counts is not None:
+        squared = jnp.where(counts[:, None], squared, 0.0)
+    return jnp.mean(squared), actor
 
 
 def squashing(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:

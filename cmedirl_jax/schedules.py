@@ -62,9 +62,13 @@ class Schedule:
     """Environment steps between updates of actor and critic."""
     target_period: int = 1
     """Environment steps between target updates (the paper: 300, with agent.tau 1)."""
-    behaviour_cloning_steps: int | None = 4000
-    """Environment steps over which agent.behaviour_cloning of a hot-started method falls linearly
-    to 0; None: no such term."""
+    frozen_actor_steps: int = 0
+    """Environment steps for which a hot-started actor is not updated, while the critic learns."""
+    cloning: Literal["none", "constant", "annealed"] = "annealed"
+    """How agent.behaviour_cloning of a hot-started method goes on: left out, at its full weight, or
+    falling linearly to 0."""
+    behaviour_cloning_steps: int = 4000
+    """Environment steps over which "annealed" cloning falls."""
 
 
 class Plan(NamedTuple):
@@ -73,6 +77,7 @@ class Plan(NamedTuple):
     Attributes:
         step: its number.
         learn: update actor and critic.
+        update_actor: a hot-started actor takes part in that update.
         update_targets: move the targets at that update.
         learn_reward: update the learned reward.
         reward_weight: weight of r_D beside r_e.
@@ -81,6 +86,7 @@ class Plan(NamedTuple):
 
     step: jax.Array
     learn: jax.Array
+    update_actor: jax.Array
     update_targets: jax.Array
     learn_reward: jax.Array
     reward_weight: jax.Array
@@ -99,14 +105,23 @@ def plan(step: jax.Array, schedule: Schedule, reward_schedule: RewardSchedule) -
     return Plan(
         step=step,
         learn=learns & (step % schedule.update_period == 0),
+        update_actor=step >= schedule.frozen_actor_steps,
         # True where a multiple was passed since the last update.
         update_targets=step % schedule.target_period < schedule.update_period,
         learn_reward=learn_reward,
         reward_weight=reward_weight,
-        cloning_weight=jnp.zeros_like(step, jnp.float32)
-        if schedule.behaviour_cloning_steps is None
-        else _falling(step, schedule.behaviour_cloning_steps),
+        cloning_weight=_cloning_weight(step, schedule),
     )
+
+
+def _cloning_weight(step: jax.Array, schedule: Schedule) -> jax.Array:
+    match schedule.cloning:
+        case "none":
+            return jnp.zeros_like(step, jnp.float32)
+        case "constant":
+            return jnp.ones_like(step, jnp.float32)
+        case "annealed":
+            return _falling(step, schedule.behaviour_cloning_steps)
 
 
 def _falling(step: jax.Array, steps: int) -> jax.Array:

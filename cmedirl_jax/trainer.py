@@ -15,15 +15,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import initialisation, methods, schedules, updates
+from cmedirl_jax import composition, initialisation, schedules, updates
 from cmedirl_jax import networks as networks_lib
+from cmedirl_jax.composition import Algorithm
 from cmedirl_jax.ddpg import DDPGState
 from cmedirl_jax.demonstrations import DemonstrationSubset
 from cmedirl_jax.envs import Env
 from cmedirl_jax.hot_start import HotStartData
 from cmedirl_jax.initialisation import TrainingState
 from cmedirl_jax.irl import RewardInfo, RewardState, base
-from cmedirl_jax.methods import Algorithm, Method, Settings
+from cmedirl_jax.methods import Method, Settings
 from cmedirl_jax.replay import ReplayState
 from cmedirl_jax.schedules import Plan
 from cmedirl_jax.types import Numeric, Params, Transition
@@ -114,7 +115,7 @@ def make(
         raise ValueError(f"{method.name} does not act: there is nothing to train")
     settings = settings or Settings()
     env_params = env.default_params if env_params is None else env_params
-    algorithm = methods.compose(env.spec, method, settings, capacity)
+    algorithm = composition.compose(env.spec, method, settings, capacity)
     agent, exploration, replay = algorithm.agent, algorithm.exploration, algorithm.replay
     background = algorithm.background
     update = updates.make(algorithm, method, settings)

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 
 from cmedirl_jax import background, demonstrations, shaping
+from cmedirl_jax.composition import Algorithm
 from cmedirl_jax.ddpg import DDPGInfo, DDPGState
 from cmedirl_jax.demonstrations import DemonstrationSubset
 from cmedirl_jax.irl import RewardInfo, RewardState, base, regularisers
-from cmedirl_jax.methods import Algorithm, Method, Settings
+from cmedirl_jax.methods import Method, Settings
 from cmedirl_jax.replay import ReplayState
 from cmedirl_jax.schedules import Plan
 from cmedirl_jax.types import Numeric, Transition
@@ -57,7 +58,8 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
     """Make the updates of a method from its parts."""
     agent, learner, replay = algorithm.agent, algorithm.learner, algorithm.replay
     schedule = settings.reward_schedule
-    clones = method.hot_start and settings.schedule.behaviour_cloning_steps is not None
+    cloning = settings.schedule.cloning
+    clones = method.hot_start and cloning != "none"
     stores_shaped = learner is not None and schedule.storage == "store"
     maxent = method.reward == "maxent"
     whole = maxent and settings.reward.objective == "trajectory"
@@ -65,8 +67,9 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
     per_iteration = schedule.trajectories if whole else schedule.batch_size
     sampled = schedule.iterations * per_iteration if method.learns_reward else 0
     agent_batch = settings.schedule.batch_size
-    # A constant, so that no branch is compiled: branches copy what passes through them.
+    # Constants, so that no branch is compiled: branches copy what passes through them.
     always_moves_targets = settings.schedule.target_period <= settings.schedule.update_period
+    freezes_actor = method.hot_start and settings.schedule.frozen_actor_steps > 0
 
     def draw(key: jax.Array, subset: DemonstrationSubset | None) -> Draws:
         batch_key, background_key, demonstrations_key = jax.random.split(key, 3)
@@ -127,17 +130,21 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
         if not stores_shaped:
             discount = agent_state.hparams.discount
             batch = shape(reward_state, batch, discount, plan.reward_weight)
+        update_actor = plan.update_actor if freezes_actor else True
         update_targets = True if always_moves_targets else plan.update_targets
         if not clones:
-            return agent.update(agent_state, batch, update_targets=update_targets)
+            return agent.update(
+                agent_state, batch, update_actor=update_actor, update_targets=update_targets
+            )
         hparams = agent_state.hparams
         faded = hparams.replace(behaviour_cloning=hparams.behaviour_cloning * plan.cloning_weight)
         agent_state, info = agent.update(
             agent_state.replace(hparams=faded),
             batch,
             demonstrations.at(pool, draws.cloning),  # type: ignore[arg-type]
+            update_actor=update_actor,
             update_targets=update_targets,
-            clone=plan.cloning_weight > 0,
+            clone=True if cloning == "constant" else plan.cloning_weight > 0,
         )
         return agent_state.replace(hparams=hparams), info
 

@@ -1,13 +1,14 @@
 """What a run will do, and whether it can: cells, budget, and every refusal before any work."""
 
+import math
 from typing import Any, NamedTuple
 
 import jax
 
-from cmedirl_jax import demonstrations, envs, methods, networks, rewards
+from cmedirl_jax import composition, demonstrations, envs, networks, rewards
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
-from cmedirl_jax.methods import METHODS, Method
+from cmedirl_jax.methods import METHODS, ExplorationSettings, Method
 from cmedirl_jax.tabular import imitation
 from experiments.bookkeeping import Budget
 from experiments.errors import UserError
@@ -74,6 +75,10 @@ def check(grid: Grid) -> None:
     for name, value in _positive(grid):
         if value is not None and value < 1:
             raise UserError(f"--{name.replace('_', '-')}: must be at least 1, got {value}")
+    frozen = grid.settings.schedule.frozen_actor_steps
+    if frozen < 0:
+        raise UserError(f"--schedule.frozen-actor-steps: must be at least 0, got {frozen}")
+    _check_noise(grid.settings.exploration)
     try:
         networks.make(env.spec, grid.settings.architecture)
     except ValueError as error:
@@ -86,11 +91,22 @@ def check(grid: Grid) -> None:
             raise UserError(f"--tabular: {error}") from error
     for name in grid.methods:
         try:
-            methods.compose(env.spec, METHODS[name], grid.settings, capacity=1)
+            composition.compose(env.spec, METHODS[name], grid.settings, capacity=1)
         except ValueError as error:
             raise UserError(f"--methods {name}: {error}") from error
     if grid.demos is None:
         check_enough(grid, grid.experts.trajectories)
+
+
+def _check_noise(settings: ExplorationSettings) -> None:
+    factor, epsilon = settings.hot_start_factor, settings.epsilon_greedy
+    if not 0.0 < factor < math.inf:
+        raise UserError(
+            f"--exploration.hot-start-factor: must be positive and finite, got {factor}"
+        )
+    largest = factor * max(epsilon.epsilon_start, epsilon.epsilon_end)
+    if settings.kind == "epsilon-greedy" and factor > 1.0 and largest > 1.0:
+        raise UserError(f"--exploration.hot-start-factor: makes epsilon {largest:g}, above 1")
 
 
 def _positive(grid: Grid) -> list[tuple[str, float | None]]:

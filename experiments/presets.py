@@ -90,9 +90,7 @@ _PAPER_SETTINGS = Settings(
     ),
     reward_schedule=RewardSchedule(period=1, stop=None, recent=None, storage="store"),
     hot_start=HotStartHParams(critic="softmax"),
-    schedule=Schedule(
-        replay_capacity=10_000, learning_starts=0, target_period=300, behaviour_cloning_steps=None
-    ),
+    schedule=Schedule(replay_capacity=10_000, learning_starts=0, target_period=300, cloning="none"),
 )
 
 PRESETS: dict[str, Grid] = {

@@ -59,8 +59,11 @@ def reference_pre_activation(actor, observation):
     return reference.mlp(actor, scaled(observation))
 
 
-def test_gradients_equal_finite_differences_of_a_float64_reference():
-    agent = plain_gradient_descent()
+@pytest.mark.parametrize("q_filter", [False, True])
+def test_gradients_equal_finite_differences_of_a_float64_reference(q_filter):
+    agent = plain_gradient_descent(
+        DDPGHParams(pre_activation_penalty=0.1, behaviour_cloning=0.7, q_filter=q_filter)
+    )
     before = agent.init(jax.random.key(0))
     # Targets apart from the parameters, or an exchange of the two would go unseen.
     target = agent.init(jax.random.key(1))
@@ -79,12 +82,23 @@ def test_gradients_equal_finite_differences_of_a_float64_reference():
     def critic_loss(critic):
         return np.mean((y - reference_q(critic, batch.observation, batch.action)) ** 2)
 
+    def prefers(actor):
+        critic = reference.float64(after.critic)
+        observation, action = demonstrations.observation, demonstrations.action
+        imitated = np.tanh(reference_pre_activation(actor, observation))
+        return reference_q(critic, observation, action) > reference_q(critic, observation, imitated)
+
     def actor_loss(actor):
         z = reference_pre_activation(actor, batch.observation)
         q = reference_q(reference.float64(after.critic), batch.observation, np.tanh(z))
         imitated = np.tanh(reference_pre_activation(actor, demonstrations.observation))
-        error = np.mean((imitated - np.asarray(demonstrations.action)) ** 2)
-        return -q.mean() + 0.1 * np.mean(z**2) + 0.7 * error
+        squared = (imitated - np.asarray(demonstrations.action)) ** 2
+        if q_filter:
+            # Nair et al. 2018: zeros where the actor's own action is valued as highly or higher.
+            squared[~prefers(actor)] = 0.0
+        return -q.mean() + 0.1 * np.mean(z**2) + 0.7 * np.mean(squared)
+
+    assert 0 < prefers(reference.float64(before.actor)).sum() < 6
 
     for loss, old, new in (
         (critic_loss, before.critic, after.critic),

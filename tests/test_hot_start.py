@@ -7,8 +7,12 @@ import scipy.special
 
 from cmedirl_jax import ddpg, demonstrations, evaluation, hot_start
 from cmedirl_jax.hot_start import HotStartHParams
+from cmedirl_jax.types import Network
 from tests import pools, reference
 from tests.test_ddpg import PROBE, SMALL, SPEC, random_batch, reference_q
+
+# Below the small network's differences of values, so that one of the steps leads by it.
+MARGIN = 0.02
 
 
 def reference_critic_loss(kind, critic, batch, returns, cells=5):
@@ -17,11 +21,17 @@ def reference_critic_loss(kind, critic, batch, returns, cells=5):
     for observation, action, g in zip(
         np.asarray(batch.observation), np.asarray(batch.action)[:, 0], returns, strict=True
     ):
+        if kind == "monte-carlo":
+            total += (reference_q(critic, observation[None], action[None, None])[0] - g) ** 2
+            continue
         nearest = np.argmin(abs(grid - action))
         actions = grid.copy()
-        if kind == "one-hot":
+        if kind in ("one-hot", "large-margin"):
             actions[nearest] = action
         q = reference_q(critic, np.tile(observation, (cells, 1)), actions[:, None])
+        if kind == "large-margin":
+            total += max(q[k] + MARGIN * (k != nearest) for k in range(cells)) - q[nearest]
+            continue
         target = np.eye(cells)[nearest]
         if kind == "softmax":
             q = scipy.special.softmax(q)
@@ -31,9 +41,9 @@ def reference_critic_loss(kind, critic, batch, returns, cells=5):
     return total / len(returns)
 
 
-@pytest.mark.parametrize("kind", ["softmax", "one-hot", "quadratic"])
+@pytest.mark.parametrize("kind", ["softmax", "one-hot", "quadratic", "monte-carlo", "large-margin"])
 def test_critic_loss_and_gradient_equal_a_float64_reference(kind):
-    hparams = HotStartHParams(critic=kind, cells=5)
+    hparams = HotStartHParams(critic=kind, cells=5, margin=MARGIN)
     batch, returns = random_batch(jax.random.key(0), 6), np.linspace(-10.0, 90.0, 6)
     critic = SMALL.critic.init(jax.random.key(1))
 
@@ -51,6 +61,24 @@ def test_critic_loss_and_gradient_equal_a_float64_reference(kind):
     chex.assert_trees_all_close(
         gradient, reference.gradient(expected, critic), rtol=5e-3, atol=1e-3 * float(value) ** 0.5
     )
+
+
+def test_the_large_margin_is_a_hinge_on_how_far_the_demonstrated_action_leads():
+    def value(slope, observation, action):
+        return slope * action[..., 0] + 0.0 * observation[..., 0]
+
+    networks = SMALL._replace(critic=Network(lambda key: jnp.zeros(()), value))
+
+    def loss(slope, margin):
+        hparams = HotStartHParams(critic="large-margin", cells=3, margin=margin)
+        observation, action = jnp.zeros((2, 2)), jnp.array([[1.0], [0.9]])
+        return hot_start.critic_loss(networks, slope, hparams, observation, action, jnp.zeros(2))[0]
+
+    slopes, margins = np.meshgrid([0.0, 0.1, 0.5, 2.0], [0.0, 0.3, 0.8], indexing="ij")
+    found = jax.vmap(loss)(jnp.asarray(slopes.ravel()), jnp.asarray(margins.ravel()))
+    leads = slopes.ravel()[:, None] * [1.0, 0.9]
+    expected = np.maximum(margins.ravel()[:, None] - leads, 0.0).mean(axis=1)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_action_cells_are_the_product_grid_with_both_bounds():

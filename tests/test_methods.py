@@ -57,3 +57,25 @@ def test_the_schedules_replay_capacity_comes_first(own, capacity):
 def test_every_exploration_can_be_named(kind, state):
     exploration = methods.make_exploration(SPEC, ExplorationSettings(kind=kind))
     assert type(exploration.init(None)).__name__ == state
+
+
+@pytest.mark.parametrize(
+    ("kind", "scaled"),
+    [
+        ("ornstein-uhlenbeck", ("sigma",)),
+        ("gaussian", ("scale",)),
+        ("epsilon-greedy", ("epsilon_start", "epsilon_end")),
+    ],
+)
+def test_only_hot_started_methods_scale_their_noise(kind, scaled):
+    settings = ExplorationSettings(kind=kind, hot_start_factor=0.25)
+    composed = dataclasses.replace(Settings(), exploration=settings)
+
+    def hparams(exploration):
+        state = exploration.init(None)
+        return dataclasses.asdict(getattr(state, "hparams", state))
+
+    own = dataclasses.asdict(getattr(settings, kind.replace("-", "_")))
+    for name, factor in (("ddpg", 1.0), ("hs-ddpg", 0.25)):
+        found = hparams(methods.compose(SPEC, METHODS[name], composed, capacity=10).exploration)
+        assert found == {k: pytest.approx(factor * v if k in scaled else v) for k, v in own.items()}

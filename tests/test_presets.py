@@ -60,6 +60,7 @@ def test_paper_is_the_papers_letter():
     assert settings.reward_schedule.period == 1
     assert math.isinf(settings.reward.bound)
     assert settings.hot_start.critic == "softmax"
+    assert settings.schedule.cloning == "none"
     assert grid.seeds == 100
     assert (grid.evaluate_every_episodes, grid.evaluation_starts_episodes) == (100, 100)
     assert grid.max_steps is None
@@ -108,21 +109,28 @@ def test_dotted_options_reach_the_nested_settings_and_leave_the_rest_to_the_pres
         "--experts.steps": "70",
         "--reward-schedule.stop": "None",
         "--exploration.epsilon-greedy.hold": "4",
-        "--hot-start.critic": "quadratic",
+        "--hot-start.critic": "large-margin",
+        "--hot-start.margin": "0.5",
+        "--schedule.frozen-actor-steps": "60",
+        "--schedule.cloning": "constant",
+        "--exploration.hot-start-factor": "0.25",
     }
-    grid = parse(["--preset", "smoke", *(word for option in options.items() for word in option)])
+    words = (word for option in options.items() for word in option)
+    grid = parse(["--preset", "smoke", *words, "--agent.q-filter"])
     before = PRESETS["smoke"]
     settings = before.settings
     assert grid.settings == dataclasses.replace(
         settings,
-        agent=settings.agent.replace(tau=0.5),
+        agent=settings.agent.replace(tau=0.5, q_filter=True),
         reward=settings.reward.replace(bound=0.2),
         reward_schedule=dataclasses.replace(settings.reward_schedule, stop=None),
         exploration=dataclasses.replace(
             settings.exploration,
+            hot_start_factor=0.25,
             epsilon_greedy=settings.exploration.epsilon_greedy.replace(hold=4.0),
         ),
-        hot_start=settings.hot_start.replace(critic="quadratic"),
+        hot_start=settings.hot_start.replace(critic="large-margin", margin=0.5),
+        schedule=dataclasses.replace(settings.schedule, frozen_actor_steps=60, cloning="constant"),
     )
     assert grid.experts == dataclasses.replace(before.experts, steps=70)
     assert dataclasses.replace(grid, settings=settings, experts=before.experts) == before

@@ -75,6 +75,18 @@ def refused(main, tmp_path, capsys):
             "--tabular: radial basis functions need two centres or more, got 1",
         ),
         ("--tabular.steps 0", "--tabular.steps: must be at least 1, got 0"),
+        (
+            "--schedule.frozen-actor-steps -1",
+            "--schedule.frozen-actor-steps: must be at least 0, got -1",
+        ),
+        (
+            "--exploration.hot-start-factor 0",
+            "--exploration.hot-start-factor: must be positive and finite, got 0.0",
+        ),
+        (
+            "--exploration.kind epsilon-greedy --exploration.hot-start-factor 1.5",
+            "--exploration.hot-start-factor: makes epsilon 1.5, above 1",
+        ),
         ("--methods ddpg td3", f"--methods: unknown method 'td3'; there are {', '.join(METHODS)}"),
         ("--methods", "--methods: give one or more, each once"),
         ("--methods ddpg ddpg", "--methods: give one or more, each once"),

@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from cmedirl_jax import schedules
 from cmedirl_jax.schedules import RewardSchedule, Schedule
@@ -14,11 +15,12 @@ def plans(schedule=None, reward=None, steps=60):
 
 def test_predicates_by_counting():
     found = plans(
-        Schedule(learning_starts=10, update_period=3, target_period=7),
+        Schedule(learning_starts=10, update_period=3, target_period=7, frozen_actor_steps=25),
         RewardSchedule(period=4, stop=30),
     )
     steps = range(60)
     assert np.flatnonzero(found.learn).tolist() == [t for t in steps if t >= 10 and t % 3 == 0]
+    assert np.flatnonzero(found.update_actor).tolist() == [t for t in steps if t >= 25]
     # Targets move with the first update at or after each multiple of their period.
     moved = np.flatnonzero(found.learn & found.update_targets).tolist()
     assert moved == [t for t in range(12, 60, 3) if any(u % 7 == 0 for u in range(t - 2, t + 1))]
@@ -36,3 +38,9 @@ def test_weights_fall_linearly_to_zero_and_stay_there():
     steps = np.arange(60)
     np.testing.assert_allclose(found.cloning_weight, np.clip(1 - steps / 50, 0, 1), atol=1e-6)
     np.testing.assert_allclose(found.reward_weight, np.clip(1 - steps / 20, 0, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize(("cloning", "weight"), [("none", 0.0), ("constant", 1.0)])
+def test_cloning_that_does_not_fade(cloning, weight):
+    found = plans(Schedule(cloning=cloning, behaviour_cloning_steps=50))
+    np.testing.assert_array_equal(found.cloning_weight, np.full(60, weight))

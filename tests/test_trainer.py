@@ -201,17 +201,40 @@ def test_the_learned_reward_reaches_the_critic():
     assert any((a != b).any() for a, b in pairs)
 
 
-def test_the_behaviour_cloning_term_fades_out():
-    faded = with_(agent={"behaviour_cloning": 5.0}, schedule={"behaviour_cloning_steps": 1})
-    cloning = with_(agent={"behaviour_cloning": 5.0})
-    without = with_(schedule={"behaviour_cloning_steps": None})
+def test_the_behaviour_cloning_term_fades_out_or_stays():
     actors = []
-    for settings in (faded, without, cloning):
+    for schedule in ({"behaviour_cloning_steps": 1}, {"cloning": "none"}, {"cloning": "constant"}):
+        settings = with_(agent={"behaviour_cloning": 5.0}, schedule=schedule)
         _, state, advance = start("hs-ddpg", settings)
         actors.append(advance(state, 0, 40)[0].agent.actor)
     chex.assert_trees_all_close(actors[0], actors[1], rtol=1e-3, atol=1e-5)
     pairs = zip(*map(jax.tree.leaves, actors[1:]), strict=True)
     assert any(np.abs(a - b).max() > 1e-4 for a, b in pairs)
+
+
+def test_a_hot_started_actor_can_be_frozen_while_the_critic_learns():
+    _, before, advance = start("hs-ddpg", with_(schedule={"frozen_actor_steps": 25}))
+    frozen, log = advance(before, 0, 25)
+    assert log.learned[10:].all()
+    chex.assert_trees_all_equal(frozen.agent.actor, before.agent.actor)
+    after, _ = advance(frozen, 25, 50)
+
+    def moved(old, new):
+        return all((a != b).any() for a, b in zip(*map(jax.tree.leaves, (old, new)), strict=True))
+
+    assert moved(before.agent.critic, frozen.agent.critic)
+    assert moved(frozen.agent.actor, after.agent.actor)
+
+
+def test_only_a_frozen_actor_compiles_a_branch():
+    def branches(method, frozen_actor_steps):
+        settings = with_(schedule={"frozen_actor_steps": frozen_actor_steps})
+        trainer = training.make(ENV, METHODS[method], settings, capacity=400)
+        state = jax.eval_shape(lambda key: trainer.init(key, data(), 3), jax.random.key(0))
+        return str(jax.make_jaxpr(trainer.run)(state, data(), jnp.arange(5))).count("cond[")
+
+    assert branches("ddpg", 25) == branches("ddpg", 0)
+    assert branches("hs-ddpg", 25) == branches("hs-ddpg", 0) + 1
 
 
 def test_targets_are_copied_every_period():
