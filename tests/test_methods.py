@@ -28,7 +28,7 @@ def test_methods_go_by_their_names():
 
 @pytest.mark.parametrize("name", METHODS)
 def test_a_reward_is_made_only_where_the_method_has_one(name):
-    algorithm = methods.compose(SPEC, METHODS[name], Settings(), capacity=10)
+    algorithm = composition.compose(SPEC, METHODS[name], Settings(), capacity=10)
     assert (algorithm.learner is None) == (name in ("ddpg", "hs-ddpg"))
 
 
@@ -42,7 +42,7 @@ def test_methods_that_do_not_act_are_not_trained(name, env):
 @pytest.mark.parametrize(("own", "capacity"), [(None, 10), (7, 7)])
 def test_the_schedules_replay_capacity_comes_first(own, capacity):
     settings = dataclasses.replace(Settings(), schedule=Schedule(replay_capacity=own))
-    algorithm = methods.compose(SPEC, METHODS["ddpg"], settings, capacity=10)
+    algorithm = composition.compose(SPEC, METHODS["ddpg"], settings, capacity=10)
     assert algorithm.replay.init().storage.shape[0] == capacity
 
 
@@ -55,7 +55,7 @@ def test_the_schedules_replay_capacity_comes_first(own, capacity):
     ],
 )
 def test_every_exploration_can_be_named(kind, state):
-    exploration = methods.make_exploration(SPEC, ExplorationSettings(kind=kind))
+    exploration = composition.make_exploration(SPEC, ExplorationSettings(kind=kind))
     assert type(exploration.init(None)).__name__ == state
 
 
@@ -77,5 +77,5 @@ def test_only_hot_started_methods_scale_their_noise(kind, scaled):
 
     own = dataclasses.asdict(getattr(settings, kind.replace("-", "_")))
     for name, factor in (("ddpg", 1.0), ("hs-ddpg", 0.25)):
-        found = hparams(methods.compose(SPEC, METHODS[name], composed, capacity=10).exploration)
+        found = hparams(composition.compose(SPEC, METHODS[name], composed, capacity=10).exploration)
         assert found == {k: pytest.approx(factor * v if k in scaled else v) for k, v in own.items()}

@@ -16,7 +16,7 @@ from experiments.run_grid import parse
 def test_every_preset_builds_every_method(name, method, spec):
     preset = PRESETS[name]
     planning.check(preset)
-    built = methods.compose(spec, METHODS[method], preset.settings, capacity=10)
+    built = composition.compose(spec, METHODS[method], preset.settings, capacity=10)
     assert (built.learner is not None) == ("me-ddpg" in method or "maxent" in method)
 
 
