@@ -2,7 +2,7 @@ import dataclasses
 
 import pytest
 
-from cmedirl_jax import envs, methods, training
+from cmedirl_jax import composition, envs, methods, training
 from cmedirl_jax.methods import METHODS, ExplorationSettings, Settings
 from cmedirl_jax.schedules import Schedule
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from cmedirl_jax import envs, methods
+from cmedirl_jax import composition, envs
 from cmedirl_jax.methods import METHODS, Settings
 from experiments import planning
 from experiments.presets import PRESETS
