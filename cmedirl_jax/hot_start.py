@@ -24,6 +24,7 @@ import numpy as np
 import optax
 
 from cmedirl_jax import demonstrations as demonstrations_lib
+from cmedirl_jax import lattice
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.demonstrations import Demonstrations, DemonstrationSubset
 from cmedirl_jax.networks import ActorCritic
@@ -195,5 +196,4 @@ def _squared_error(q: jax.Array, target: jax.Array) -> jax.Array:
 
 def action_cells(spec: EnvSpec, cells: int) -> np.ndarray:
     """The product grid of `cells` values per action dimension, bounds included: `[cells^A, A]`."""
-    axes = np.linspace(spec.action_low, spec.action_high, cells).T
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, spec.action_dim)
+    return lattice.product(*np.linspace(spec.action_low, spec.action_high, cells).T)

@@ -243,6 +243,15 @@ def test_noise_leaves_the_choices_and_the_random_actions_as_they_are():
     assert (plain[0], plain[1]) == (noisy[0], noisy[1])
 
 
+def test_with_noise_no_random_action_is_on_a_bound():
+    # Floats lie so far apart here that one draw in sixteen is rounded to a bound.
+    coarse = SPEC._replace(action_low=np.float32([2**20]), action_high=np.float32([2**20 + 1]))
+    behaviour = exploration.epsilon_greedy(coarse, EpsilonGreedyHParams(noise=0.3))
+    action = jax.vmap(behaviour.draw)(jax.random.split(KEY, 1000))[1]
+    assert action.min() > coarse.action_low
+    assert action.max() < coarse.action_high
+
+
 def test_an_episode_does_not_inherit_a_held_action():
     behaviour = exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=5.0))
     begin, decline = (jnp.float32(0.0), jnp.ones(1), None), (jnp.float32(1.0), jnp.ones(1), None)

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmedirl_jax import lattice
 from cmedirl_jax.envs import Env, Step
 from cmedirl_jax.tabular import interpolation
 from cmedirl_jax.tabular.dynamics import SparseDynamics
@@ -71,9 +72,7 @@ def make(
     params = env.default_params if params is None else params
     states, actions = grids(spec, state_shape, action_shape)
     within = (np.arange(subsamples) + 0.5) / subsamples - 0.5
-    offsets = np.stack(np.meshgrid(*[within] * len(states.shape)), axis=-1).reshape(
-        -1, len(states.shape)
-    )
+    offsets = lattice.product(*[within] * len(states.shape))
 
     def step(observation: jax.Array, action: jax.Array) -> Step:
         inside = jnp.clip(observation, spec.observation_low, spec.observation_high)

@@ -48,7 +48,7 @@ class TabularSettings:
     """Discount of the soft-optimal policy and of both visitations."""
     temperature: float = 1.0
     """Temperature alpha of the soft-optimal policy."""
-    reward: Literal["state-action", "state"] = "state-action"
+    reward: rewards.Inputs = "state-action"
     """Whether the reward is of pairs or of states alone."""
     prior_precision: float = 1e-3
     """Precision of the Gaussian prior on theta, against the log-likelihood of one demonstration."""
@@ -151,9 +151,9 @@ def _fit(
         "steps": settings.steps,
     }
     if linear:
-        features = rewards.radial_basis(spec, settings.centres)(*inputs)
+        features = rewards.radial_basis(spec, settings.centres, settings.reward)(*inputs)
         return maxent.maxent_irl(mdp.dynamics, features, demonstrations, **shared)
-    network = rewards.mlp(spec, settings.hidden)
+    network = rewards.mlp(spec, settings.hidden, settings.reward)
     return maxent.deep_maxent_irl(key, network, inputs, mdp.dynamics, demonstrations, **shared)
 
 

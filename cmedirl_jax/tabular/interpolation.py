@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmedirl_jax import lattice
 from cmedirl_jax.types import Array
 
 
@@ -48,11 +49,8 @@ class Grid:
 
 def points(grid: Grid) -> np.ndarray:
     """All points, `[size, D]` float32, the last dimension fastest."""
-    axes = [
-        np.linspace(*bounds, dtype=np.float32)
-        for bounds in zip(grid.low, grid.high, grid.shape, strict=True)
-    ]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+    bounds = zip(grid.low, grid.high, grid.shape, strict=True)
+    return lattice.product(*(np.linspace(*axis, dtype=np.float32) for axis in bounds))
 
 
 def interpolate(grid: Grid, position: Array) -> tuple[jax.Array, jax.Array]:
