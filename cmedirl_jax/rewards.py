@@ -112,13 +112,3 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
         return jnp.cos(jnp.sum(x[..., None, :] * frequencies, axis=-1))
 
     return features
-
-
-def bounded(output, bound):
-    """`bound * tanh(output)`, which keeps |r_D| < bound; `bound` = inf leaves it unbounded.
-
-    A constant in r_D is not identified by the demonstrations but changes the policy of an episodic
-    task, so an unbounded r_D can make loitering better than finishing.
-    """
-    finite = jnp.where(jnp.isinf(bound), 1.0, bound)
-    return jnp.where(jnp.isinf(bound), output, finite * jnp.tanh(output))

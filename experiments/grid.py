@@ -1,5 +1,6 @@
 """A whole run: demonstrations, then cell after cell, then the summary and the figures."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
@@ -84,7 +85,7 @@ def _train_cells(
     devices: list[jax.Device],
     console: Console,
 ) -> None:
-    budget = planning.budget_of(grid, env, METHODS["ddpg"])
+    budget = planning.budget_of(grid, env)
     pool_path = grid.folder / "demonstrations" / "pool.npz"
     needs_pool = any(cell.n_demos for cell in todo)
     pool = given if given is not None else _reusable(pool_path, env)
@@ -131,7 +132,9 @@ def _train_cells(
                     data if cell.n_demos else None,
                     cell.n_demos,
                     seeds_count=grid.seeds,
-                    budget=planning.budget_of(grid, env, cell.method),
+                    budget=budget
+                    if cell.method.interacts
+                    else dataclasses.replace(budget, max_steps=0),
                     threshold=env.spec.reward_threshold,
                     report=_stepwise(report, grid.seeds),
                 )

@@ -36,9 +36,9 @@ def cells_of(grid: Grid) -> list[Cell]:
     ]
 
 
-def budget_of(grid: Grid, env: Env, method: Method) -> Budget:
-    """How long each learner of a method trains; not at all where it never acts."""
-    most = [grid.max_steps if method.interacts else 0]
+def budget_of(grid: Grid, env: Env) -> Budget:
+    """How long each learner trains."""
+    most = [grid.max_steps]
     if grid.max_episodes is not None:
         most.append(grid.max_episodes * env.spec.max_episode_steps)
     return Budget(

@@ -132,8 +132,8 @@ def evaluation_rows(result, protocol="steps", seed=None):
             found.env_step,
             found.episode,
             found.evaluation.return_mean,
-            found.q_mean,
-            found.critic_loss,
+            found.means.q_mean,
+            found.means.critic_loss,
             strict=True,
         )
         if seed is None or row[0] == seed
@@ -170,8 +170,7 @@ def test_every_seed_is_first_evaluated_at_step_0_before_any_update(by_steps):
     np.testing.assert_array_equal(first.seed, np.arange(SEEDS))
     np.testing.assert_array_equal(first.env_step, np.zeros(SEEDS))
     np.testing.assert_array_equal(first.episode, np.zeros(SEEDS))
-    assert np.isnan(first.q_mean).all()
-    assert np.isnan(first.critic_loss).all()
+    assert all(np.isnan(mean).all() for mean in first.means)
 
 
 def test_evaluations_come_at_the_multiples_and_at_the_end(by_steps):

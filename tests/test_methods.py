@@ -11,15 +11,15 @@ SPEC = envs.make("MountainCarContinuous-v0").spec
 
 def test_the_papers_methods_are_the_four_combinations_of_its_two_parts():
     paper = {name: METHODS[name] for name in methods.PAPER_METHODS}
-    parts = {name: (method.hot_start, method.learned_reward) for name, method in paper.items()}
+    parts = {name: (method.hot_start, method.reward) for name, method in paper.items()}
     assert parts == {
-        "ddpg": (False, False),
-        "hs-ddpg": (True, False),
-        "me-ddpg": (False, True),
-        "hs-me-ddpg": (True, True),
+        "ddpg": (False, None),
+        "hs-ddpg": (True, None),
+        "me-ddpg": (False, "maxent"),
+        "hs-me-ddpg": (True, "maxent"),
     }
     assert [m.uses_demonstrations for m in paper.values()] == [False, True, True, True]
-    assert all(m.interacts and m.tabular_reward is None for m in paper.values())
+    assert all(m.interacts and m.shaping == "additive" for m in paper.values())
 
 
 def test_methods_go_by_their_names():
@@ -29,7 +29,8 @@ def test_methods_go_by_their_names():
 @pytest.mark.parametrize("name", METHODS)
 def test_a_reward_is_made_only_where_the_method_has_one(name):
     algorithm = composition.compose(SPEC, METHODS[name], Settings(), capacity=10)
-    assert (algorithm.learner is None) == (name in ("ddpg", "hs-ddpg"))
+    assert (algorithm.learner is None) == (name in ("ddpg", "hs-ddpg", "bc"))
+    assert (algorithm.background is not None) == METHODS[name].learns_reward
 
 
 @pytest.mark.parametrize("name", ["maxent-irl", "deep-maxent-irl"])

@@ -35,13 +35,13 @@ def cell(method, n_demos, episodes=3):
 
 def test_configuration_is_strict_json_with_versions(tmp_path):
     grid = dataclasses.replace(PRESETS["paper"], out=tmp_path)
-    assert math.isinf(grid.settings.reward.bound)
+    assert math.isinf(grid.settings.reward.weight_limit)
     text = (results.open_folder(grid) / "config.json").read_text()
     written = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert written["schema"] == results.SCHEMA
     assert written["versions"]["jax"] == jax.__version__
     assert written["config"]["n_demos"] == [200]
-    assert written["config"]["settings"]["reward"]["bound"] == "inf"
+    assert written["config"]["settings"]["reward"]["weight_limit"] == "inf"
     assert written["config"]["settings"]["hot_start"]["critic"] == "softmax"
 
 
@@ -62,8 +62,8 @@ def test_the_same_configuration_enters_again_and_changes_nothing(preset, tmp_pat
         ({"max_steps": None, "max_episodes": 5}, "--max-episodes None, not 5;"),
         ({"demos": Path(__file__)}, f"--demos None, not {__file__};"),
         (
-            {"settings": Settings(reward=IRLHParams(bound=float("inf")))},
-            "--reward.bound 0.1, not inf;",
+            {"settings": Settings(reward=IRLHParams(weight_limit=5.0))},
+            "--reward.weight-limit inf, not 5.0;",
         ),
     ],
 )

@@ -1,35 +1,11 @@
 import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from cmedirl_jax import rewards
 from tests import reference
-
-
-@pytest.mark.parametrize("bound", [0.0, 0.1, 3.0])
-def test_bounded_is_a_scaled_tanh(bound):
-    x = np.linspace(-4, 4, 9, dtype=np.float32)
-    np.testing.assert_allclose(rewards.bounded(x, bound), bound * np.tanh(x), rtol=1e-6)
-
-
-def test_an_infinite_bound_leaves_the_output_as_it_is():
-    x = np.linspace(-40, 40, 9, dtype=np.float32)
-    np.testing.assert_array_equal(rewards.bounded(x, jnp.inf), x)
-
-
-@pytest.mark.parametrize(("bound", "slopes"), [(0.5, (0.5, 0.0)), (np.inf, (1.0, 0.0))])
-def test_gradients_are_finite_whatever_the_bound(bound, slopes):
-    by_output, by_bound = jax.grad(rewards.bounded, argnums=(0, 1))(0.0, bound)
-    assert (by_output, by_bound) == slopes
-
-
-def test_bounds_can_be_vmapped_over():
-    bounds = jnp.array([0.1, 1.0, jnp.inf])
-    actual = jax.vmap(rewards.bounded, in_axes=(None, 0))(2.0, bounds)
-    np.testing.assert_allclose(actual, [0.1 * np.tanh(2), np.tanh(2), 2.0], rtol=1e-6)
 
 
 def pairs(spec):

@@ -4,7 +4,7 @@ import pytest
 
 from cmedirl_jax.evaluation import Evaluation
 from experiments import tables
-from experiments.bookkeeping import EpisodeRows, EvaluationRows
+from experiments.bookkeeping import EpisodeRows, EvaluationRows, Means
 from experiments.cells import CellResult
 from experiments.gymnasium_replay import Replay
 
@@ -14,7 +14,7 @@ SCHEMAS = {
         "protocol": pl.String,
         **dict.fromkeys(("seed", "env_step", "episode"), pl.Int32),
         **dict.fromkeys(("return_mean", "return_std", "goal_fraction", "length_mean"), pl.Float32),
-        **dict.fromkeys(("q_mean", "critic_loss"), pl.Float64),
+        **dict.fromkeys(Means._fields, pl.Float64),
     },
     "episodes": {
         **dict.fromkeys(("seed", "episode", "env_step"), pl.Int32),
@@ -43,8 +43,7 @@ def evaluation(protocol, env_step, *seeds):
         np.full(len(seeds), env_step),
         np.full(len(seeds), env_step // 100),
         Evaluation(floats(env_step), floats(1), floats(2), floats(3)),
-        unknown,
-        unknown,
+        Means(*(unknown for _ in Means._fields)),
     )
 
 
@@ -120,10 +119,10 @@ def test_evaluations_are_in_order_of_seed_and_step(found):
 
 def test_statistics_of_no_update_are_missing_rather_than_nan(found):
     for env_step, *statistics in (
-        found["evaluations"].select("env_step", "q_mean", "critic_loss").iter_rows()
+        found["evaluations"].select("env_step", *Means._fields).iter_rows()
     ):
         missing = [value is None for value in statistics]
-        assert missing == [env_step == 0] * 2
+        assert missing == [env_step == 0] * len(Means._fields)
 
 
 def test_episodes_are_in_order_of_seed_and_number(found):

@@ -42,7 +42,7 @@ def test_one_evaluation_of_the_greedy_policy_and_one_of_the_soft(result, program
     for found in (greedy, soft):
         assert found.seed.tolist() == [0, 1, 2]
         assert found.env_step.tolist() == found.episode.tolist() == [0, 0, 0]
-        assert np.isnan(found.q_mean).all()
+        assert all(np.isnan(mean).all() for mean in found.means)
     params = env.default_params
     act = discretise.greedy(programs.mdp, result.best[1])
     alone = evaluation.evaluate(act, env, params, 2)

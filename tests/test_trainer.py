@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmedirl_jax import hot_start, replay, seeds, training
+from cmedirl_jax import hot_start, replay, seeds, training, updates
 from cmedirl_jax.hot_start import HotStartHParams
-from cmedirl_jax.methods import METHODS, Settings
+from cmedirl_jax.methods import METHODS, RewardNetworkSettings, Settings
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.schedules import RewardSchedule, Schedule
 from tests import pools
@@ -19,7 +19,8 @@ ENV = pools.ENV._replace(default_params=pools.ENV.default_params.replace(max_epi
 SMALL = Settings(
     architecture=Architecture(hidden=(8, 8)),
     schedule=Schedule(batch_size=8, learning_starts=10),
-    reward_schedule=RewardSchedule(batch_size=8, hidden=(8,), stop=None),
+    reward_network=RewardNetworkSettings(hidden=(8,)),
+    reward_schedule=RewardSchedule(batch_size=8, stop=None),
     hot_start=HotStartHParams(steps=20),
 )
 
@@ -199,6 +200,97 @@ def test_the_learned_reward_reaches_the_critic():
     unshaped, _ = plain_advance(plain, 0, 40)
     pairs = zip(*map(jax.tree.leaves, (shaped.agent.critic, unshaped.agent.critic)), strict=True)
     assert any((a != b).any() for a, b in pairs)
+
+
+@pytest.mark.parametrize(
+    ("shaping", "inputs"),
+    [("additive", "state-action"), ("alone", "state-action"), ("potential", "state")],
+)
+def test_r_star_is_stored_as_the_shaping_says(shaping, inputs):
+    settings = with_(
+        reward={"bound": 2.0, "absorbing": shaping != "potential"},
+        reward_schedule={"shaping": shaping, "storage": "store", "stop": 0},
+        reward_network={"inputs": inputs},
+    )
+    trainer, state, advance = start("me-ddpg", settings)
+    _, plain, plain_advance = start("ddpg")
+    found = stored(advance(state, 0, 8)[0], 8)
+    r_e = stored(plain_advance(plain, 0, 8)[0], 8).reward
+    learner = trainer.algorithm.learner
+    pairs = found.observation, found.action
+    r_d = learner.reward(state.reward, *pairs)
+    if shaping == "potential":
+        expected = r_e + 0.99 * learner.reward(state.reward, found.next_observation, pairs[1]) - r_d
+    else:
+        expected = r_d + (r_e if shaping == "additive" else 0.0)
+    assert not found.terminated.any()
+    assert np.abs(r_d).max() > 1e-5
+    np.testing.assert_allclose(found.reward, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_terminated_transition_earns_what_the_absorbing_state_goes_on_to():
+    settings = with_(reward={"absorbing": True})
+    trainer, state, _ = start("me-ddpg", settings)
+    update = updates.make(trainer.algorithm, METHODS["me-ddpg"], settings)
+    reward = state.reward.replace(params=state.reward.params._replace(absorbing=jnp.asarray(0.3)))
+    batch = replay.unpack(ENV.spec, jnp.ones((2, 7)))._replace(terminated=jnp.array([False, True]))
+    shaped = update.shape(reward, batch, 0.9, 0.5)
+    r_d = trainer.algorithm.learner.reward(reward, batch.observation, batch.action)
+    absorbing = 0.1 * np.tanh(0.3)
+    expected = batch.reward + 0.5 * (r_d + np.array([0.0, 0.9 / (1 - 0.9) * absorbing]))
+    np.testing.assert_allclose(shaped.reward, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("objective", "weights"),
+    [
+        ("transition", "recorded"),
+        ("transition", "fusion"),
+        ("trajectory", "uniform"),
+        ("trajectory", "fusion"),
+    ],
+)
+def test_the_objectives_learn_with_their_weights(objective, weights):
+    settings = with_(
+        reward={"objective": objective, "weight_limit": 3.0, "gradient_penalty": 0.1},
+        reward_schedule={
+            "weights": weights,
+            "snapshots": 2,
+            "snapshot_period": 10,
+            "trajectories": 2,
+            "episodes": 2,
+            "period": 20,
+            "iterations": 2,
+        },
+    )
+    _, before, advance = start("me-ddpg", settings)
+    after, log = advance(before, 0, 41)
+    assert log.reward_learned.sum() == 2
+    of_updates = jax.tree.map(lambda leaf: np.asarray(leaf)[[20, 40]], log.reward)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((of_updates, after.reward)))
+    most = 4 if objective == "trajectory" else 16
+    size = of_updates.effective_sample_size
+    assert ((size > 0.99) & (size <= most + 1e-3)).all()
+    networks = (before.reward.params.network, after.reward.params.network)
+    pairs = zip(*map(jax.tree.leaves, networks), strict=True)
+    assert all((a != b).any() for a, b in pairs)
+
+
+@pytest.mark.parametrize("method", ["gail", "random-reward", "ddpg-plus-constant"])
+def test_rewards_that_do_not_learn_stay_and_a_discriminator_does_not(method):
+    _, before, advance = start(method)
+    after, log = advance(before, 0, 30)
+    pairs = zip(*map(jax.tree.leaves, (before.reward.params, after.reward.params)), strict=True)
+    assert [(a == b).all() for a, b in pairs][-1] == (method != "gail")
+    assert (log.reward is None) == (method != "gail")
+
+
+def test_behaviour_cloning_is_the_hot_start_alone():
+    _, state, advance = start("bc")
+    _, hot, _ = start("hs-ddpg")
+    chex.assert_trees_all_equal(state.agent.actor, hot.agent.actor)
+    with pytest.raises(ValueError, match="bc does not act"):
+        advance(state, 0, 5)
 
 
 def test_the_behaviour_cloning_term_fades_out_or_stays():

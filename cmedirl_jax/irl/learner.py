@@ -94,8 +94,13 @@ def make(
         network: f(s, a), default `rewards.mlp(spec)`.
         optimizer: default Adam at `state.hparams.learning_rate`; it is handed the gradient of the
             *negative* posterior, to descend.
+
+    Raises:
+        ValueError: for an infinite bound; `bounded_by` none is what leaves r_D unbounded.
     """
     hparams = hparams or IRLHParams()
+    if isinstance(hparams.bound, float) and np.isinf(hparams.bound):
+        raise ValueError('the bound must be finite; for an unbounded reward take bounded_by "none"')
     network = network or rewards.mlp(spec)
     tx = optax.with_extra_args_support(optimizer or optimizers.adam())
     checked = base.trajectories if hparams.objective == "trajectory" else base.pairs
