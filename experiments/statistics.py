@@ -137,6 +137,25 @@ def curves(evaluations: pl.DataFrame) -> dict[int, SeedCurve]:
     }
 
 
+def of_seeds(evaluations: pl.DataFrame, diverged: np.ndarray, threshold: float) -> SeedStatistics:
+    """Statistics of every seed of a cell, leaves `[seeds]` float.
+
+    Args:
+        evaluations: the cell's rows of evaluations.parquet.
+        diverged: `[seeds]` bool.
+        threshold: the return that counts as solved.
+    """
+    by_seed = curves(evaluations)
+    longest = max(curve.return_mean.size for curve in by_seed.values())
+    found = [
+        seed_statistics(
+            curve, threshold, missing=longest - curve.return_mean.size if diverged[seed] else 0
+        )
+        for seed, curve in by_seed.items()
+    ]
+    return SeedStatistics(*(np.array(column, float) for column in zip(*found, strict=True)))
+
+
 def summarise(
     evaluations: pl.DataFrame,
     seeds: pl.DataFrame,
@@ -155,16 +174,8 @@ def summarise(
         interacts: whether the method acts in the environment; one that never does has a single
             evaluation, and nothing to converge by.
     """
-    by_seed = curves(evaluations)
     diverged = seeds["diverged"].to_numpy()
-    longest = max(curve.return_mean.size for curve in by_seed.values())
-    found = [
-        seed_statistics(
-            curve, threshold, missing=longest - curve.return_mean.size if diverged[seed] else 0
-        )
-        for seed, curve in by_seed.items()
-    ]
-    columns = SeedStatistics(*(np.array(column, float) for column in zip(*found, strict=True)))
+    columns = of_seeds(evaluations, diverged, threshold)
     converged = np.isfinite(columns.convergence_env_step)
     first = evaluations.row(0, named=True)
     dips = columns.dip_fraction[~np.isnan(columns.dip_fraction)]
@@ -180,7 +191,7 @@ def summarise(
     restricted = np.where(converged, columns.convergence_episode, float(max_episodes or 0))
     row: dict[str, Any] = {
         **{name: first[name] for name in ("expert", "method", "n_demos")},
-        "seeds": len(found),
+        "seeds": diverged.size,
         **_interval("converged_fraction", lambda: share(converged), interacts),
         **_interval(
             "convergence_env_step_median",

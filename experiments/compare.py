@@ -1,0 +1,173 @@
+"""`python -m experiments.compare FOLDER`: each cell of a run against one of them, seed by seed.
+
+Seeds are paired: seed i of every method starts from the same networks and draws the same noise. So
+the differences are of pairs, their intervals bootstrapped over pairs, their p-values from flipping
+the signs of pairs, adjusted for the number of cells by Holm's method.
+"""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import polars as pl
+import scipy.stats
+import tyro
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from cmedirl_jax import envs
+from experiments import results, statistics
+from experiments.errors import UserError
+from experiments.statistics import SeedStatistics
+
+MEASURES: dict[str, Callable[[SeedStatistics, int], np.ndarray]] = {
+    "convergence_env_step": lambda seeds, most: np.minimum(seeds.convergence_env_step, most),
+    "area": lambda seeds, most: seeds.area,
+    "final_return": lambda seeds, most: seeds.final_return,
+}
+"""What is compared; a seed that never converged counts as having done so at its last step."""
+
+RESAMPLES = 9_999
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Which run, and against which of its cells."""
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """A run's folder."""
+    against: str = "ddpg"
+    """The method that every other is compared with."""
+    out: Path | None = None
+    """A CSV file for the table."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    options = tyro.cli(
+        Options, prog="python -m experiments.compare", description=__doc__, args=arguments
+    )
+    try:
+        table = compare(options.folder, options.against)
+    except UserError as error:
+        print(f"compare: {error}", file=sys.stderr)
+        return 2
+    if options.out is not None:
+        with results.replacing(options.out) as partial:
+            table.write_csv(partial)
+    Console(width=None if sys.stdout.isatty() else 120).print(shown(table, options.against))
+    return 0
+
+
+def compare(folder: Path, against: str) -> pl.DataFrame:
+    """The paired differences of a finished run's cells to the cell of the method `against`.
+
+    Raises:
+        UserError: if the folder holds no run, or not exactly one cell of that method, or no other.
+    """
+    path = folder / "config.json"
+    if not path.exists() or results.read(folder, "evaluations") is None:
+        raise UserError(f"{folder}: holds no finished cell of a run")
+    threshold = envs.make(json.loads(path.read_text())["config"]["env"]).spec.reward_threshold
+    cells = _seed_statistics(folder, threshold)
+    baseline = [cell for cell in cells if cell[0] == against]
+    if len(baseline) != 1:
+        methods = ", ".join(sorted({method for method, _ in cells}))
+        raise UserError(
+            f"--against: {folder} must hold one cell of {against!r}, it holds {len(baseline)}; "
+            f"its methods are {methods}"
+        )
+    reference, most = cells.pop(baseline[0])
+    if not cells:
+        raise UserError(f"{folder}: holds no method beside {against}")
+    rows = []
+    for name, measure in MEASURES.items():
+        found = [
+            {
+                "method": method,
+                "n_demos": n_demos,
+                "measure": name,
+                **_paired(measure(seeds, most), measure(reference, most)),
+            }
+            for (method, n_demos), (seeds, _) in cells.items()
+        ]
+        adjusted = holm(np.array([row["p_value"] for row in found]))
+        rows += [row | {"p_holm": p} for row, p in zip(found, adjusted, strict=True)]
+    return pl.DataFrame(rows)
+
+
+def holm(p_values: np.ndarray) -> np.ndarray:
+    """Holm's (1979) adjusted p-values, `[tests]`."""
+    order = np.argsort(p_values)
+    scaled = p_values[order] * np.arange(p_values.size, 0, -1)
+    adjusted = np.empty_like(p_values)
+    adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
+    return adjusted
+
+
+def _seed_statistics(
+    folder: Path, threshold: float
+) -> dict[tuple[str, int], tuple[SeedStatistics, int]]:
+    """Of every cell whose method acts: its seeds' statistics, and the last step evaluated."""
+    evaluations, seeds = (results.read(folder, name) for name in ("evaluations", "seeds"))
+    assert evaluations is not None
+    assert seeds is not None
+    by_cell = ["method", "n_demos"]
+    diverged = {
+        key: group.sort("seed")["diverged"].to_numpy() for key, group in seeds.group_by(by_cell)
+    }
+    found = {}
+    for key, group in evaluations.group_by(by_cell, maintain_order=True):
+        last = int(group["env_step"].max())  # type: ignore[arg-type]
+        if last > 0:
+            method, n_demos = key
+            columns = statistics.of_seeds(group, diverged[key], threshold)
+            found[str(method), int(n_demos)] = columns, last  # type: ignore[call-overload]
+    return found
+
+
+def _paired(values: np.ndarray, reference: np.ndarray) -> dict[str, Any]:
+    difference = values - reference
+    interval = statistics.mean(difference)
+    test = scipy.stats.permutation_test(
+        (values, reference),
+        lambda x, y, axis: np.mean(x - y, axis=axis),
+        permutation_type="samples",
+        n_resamples=RESAMPLES,
+        vectorized=True,
+        rng=np.random.default_rng(0),
+    )
+    return {
+        "seeds": difference.size,
+        "difference": interval.estimate,
+        "difference_low": interval.low,
+        "difference_high": interval.high,
+        "p_value": float(test.pvalue),
+    }
+
+
+def shown(table: pl.DataFrame, against: str) -> Table:
+    """The differences as a table for the screen, a row per cell."""
+    printed = Table(title=f"mean paired difference to {against}; 95% intervals", box=box.SIMPLE)
+    printed.add_column("method")
+    printed.add_column("N_T", justify="right")
+    for measure in MEASURES:
+        printed.add_column(measure.replace("_", " "), justify="right")
+        printed.add_column("p (Holm)", justify="right")
+    for (method, n_demos), group in table.group_by("method", "n_demos", maintain_order=True):
+        row = []
+        for found in group.iter_rows(named=True):
+            form = "{:+,.0f}" if found["measure"] == "convergence_env_step" else "{:+.1f}"
+            numbers = (found[f"difference{end}"] for end in ("", "_low", "_high"))
+            row += ["{} [{}, {}]".format(*map(form.format, numbers)), f"{found['p_holm']:.4f}"]
+        printed.add_row(str(method), str(n_demos) if n_demos else "-", *row)
+    return printed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

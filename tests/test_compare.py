@@ -1,0 +1,102 @@
+import dataclasses
+
+import numpy as np
+import polars as pl
+import pytest
+import scipy.stats
+
+from experiments import compare, results
+from experiments.presets import PRESETS
+
+STEPS = np.array([0, 100, 200])
+SEEDS = 6
+
+
+def cell(method, n_demos, curves, diverged=()):
+    """Rows of a finished cell whose seeds have these returns at `STEPS`."""
+    labels = {"method": method, "n_demos": n_demos}
+    evaluations = pl.concat(
+        pl.DataFrame(
+            {
+                **labels,
+                "protocol": "steps",
+                "seed": seed,
+                "env_step": STEPS[: len(curve)],
+                "episode": STEPS[: len(curve)] // 50,
+                "return_mean": np.asarray(curve, float),
+            }
+        )
+        for seed, curve in enumerate(curves)
+    )
+    seeds = pl.DataFrame(
+        {**labels, "seed": range(len(curves)), "diverged": np.isin(range(len(curves)), diverged)}
+    )
+    return {"evaluations": evaluations, "seeds": seeds, "episodes": seeds}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Method b reaches 90 a hundred steps before a, but for a seed that never does."""
+    results.open_folder(dataclasses.replace(PRESETS["smoke"], out=tmp_path))
+    slow, fast, never = [0, 20, 95], [10, 95, 95], [0, 0, 0]
+    results.append(tmp_path, cell("a", 0, [slow] * SEEDS))
+    results.append(tmp_path, cell("b", 5, [*[fast] * (SEEDS - 1), never]))
+    results.append(tmp_path, cell("c", 5, [slow] * SEEDS))
+    results.append(tmp_path, cell("never-acts", 5, [[95]] * SEEDS))
+    return tmp_path
+
+
+def test_differences_are_of_pairs_of_seeds(folder):
+    table = compare.compare(folder, "a")
+    assert table["method"].unique(maintain_order=True).to_list() == ["b", "c"]
+    found = {row["measure"]: row for row in table.filter(pl.col("method") == "b").to_dicts()}
+    steps = np.array([-100.0] * (SEEDS - 1) + [0.0])  # Never counts as the last step.
+    area = np.array([85 / 3] * (SEEDS - 1) + [-115 / 3])
+    final = np.array([0.0] * (SEEDS - 1) + [-95.0])
+    for name, expected in (
+        ("convergence_env_step", steps),
+        ("area", area),
+        ("final_return", final),
+    ):
+        assert found[name]["difference"] == pytest.approx(expected.mean())
+        assert found[name]["difference_low"] <= expected.mean() <= found[name]["difference_high"]
+        signs = np.array(np.meshgrid(*[[-1, 1]] * SEEDS)).reshape(SEEDS, -1)
+        means = expected @ signs / SEEDS
+        p_value = min(2 * np.mean(means <= -abs(expected.mean()) + 1e-9), 1.0)
+        assert found[name]["p_value"] == pytest.approx(p_value)
+    same = table.filter(pl.col("method") == "c")
+    assert same["difference"].to_list() == [0.0] * 3
+    assert same["p_value"].to_list() == [1.0] * 3
+
+
+def test_holms_p_values_are_stepwise():
+    found = compare.holm(np.array([0.01, 0.04, 0.03, 0.005]))
+    np.testing.assert_allclose(found, [0.03, 0.06, 0.06, 0.02])
+    assert compare.holm(np.array([0.9, 0.8])).tolist() == [1.0, 1.0]
+
+
+def test_holm_rejects_no_less_than_bonferroni_and_no_more_than_single_tests():
+    p_values = scipy.stats.uniform.rvs(size=20, random_state=0)
+    adjusted = compare.holm(p_values)
+    assert ((adjusted >= p_values) & (adjusted <= np.minimum(20 * p_values, 1.0))).all()
+
+
+def test_the_command_prints_and_writes_the_table(folder, tmp_path, capsys):
+    out = tmp_path / "differences.csv"
+    assert compare.main([str(folder), "--against", "a", "--out", str(out)]) == 0
+    assert "mean paired difference to a" in capsys.readouterr().out
+    assert pl.read_csv(out).height == 2 * 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["nowhere"], "nowhere: holds no finished cell"),
+        (["{folder}", "--against", "ddpg"], "must hold one cell of 'ddpg', it holds 0"),
+    ],
+)
+def test_mistakes_are_refused_in_a_line(folder, arguments, named, capsys):
+    assert compare.main([argument.format(folder=folder) for argument in arguments]) == 2
+    error = capsys.readouterr().err
+    assert named in error
+    assert error.count("\n") == 1
