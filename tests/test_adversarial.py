@@ -33,9 +33,13 @@ def learner(hparams=None, **kwargs):
     return adversarial.make(SPEC, hparams, **parts)
 
 
-def begun(algorithm):
+ALGORITHM = learner(GAILHParams(scale=0.7, output_penalty=0.3))
+update = jax.jit(ALGORITHM.update)
+
+
+def begun():
     """The last layer begins near zero, where D is a half of everything."""
-    state = algorithm.init(KEY)
+    state = ALGORITHM.init(KEY)
     return state.replace(params=jax.tree.map(lambda leaf: 3.0 * leaf, state.params))
 
 
@@ -57,9 +61,8 @@ def reference_likelihood(params, demonstrations, background):
 
 def test_gradient_equals_finite_differences_of_a_float64_likelihood():
     demonstrations, background = masked(1, 7), masked(2, 5)
-    algorithm = learner(GAILHParams(output_penalty=0.3))
-    before = begun(algorithm)
-    after, info = jax.jit(algorithm.update)(before, demonstrations, background)
+    before = begun()
+    after, info = update(before, demonstrations, background)
 
     def loss(params):
         output = np.r_[logits(params, demonstrations), logits(params, background)]
@@ -76,9 +79,8 @@ def test_gradient_equals_finite_differences_of_a_float64_likelihood():
 
 def test_infos_are_of_the_state_before_the_update():
     demonstrations, background = masked(1, 7), masked(2, 5)
-    algorithm = learner(GAILHParams(scale=0.7))
-    before = begun(algorithm)
-    _, info = jax.jit(algorithm.update)(before, demonstrations, background)
+    before = begun()
+    _, info = update(before, demonstrations, background)
     rewards = [
         0.7 * np.logaddexp(0.0, logits(before.params, batch)).mean()
         for batch in (demonstrations, background)
@@ -97,10 +99,8 @@ def test_what_the_mask_leaves_out_does_not_count():
         lambda leaf: jnp.where(background.mask.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 1),
         background.transition,
     )
-    algorithm = learner()
-    update = jax.jit(algorithm.update)
-    found = update(begun(algorithm), demonstrations, background)
-    spoilt = update(begun(algorithm), demonstrations, background._replace(transition=spoilt))
+    found = update(begun(), demonstrations, background)
+    spoilt = update(begun(), demonstrations, background._replace(transition=spoilt))
     chex.assert_trees_all_equal(found, spoilt)
 
 
@@ -115,10 +115,10 @@ def test_the_optimal_logit_is_that_of_the_densities_ratio():
     demonstrated, sampled = np.array([6, 1, 2, 3]), np.array([1, 5, 2, 4])
     optimum = np.log(demonstrated / 12) - np.log(sampled / 12)
     algorithm = learner(GAILHParams(output_penalty=0.0), network=TABLE)
-    update = jax.jit(algorithm.update)
+    on_table = jax.jit(algorithm.update)
     for offset, vanishes in ((np.zeros(CELLS), True), (np.array([0.1, 0, 0, -0.1]), False)):
         state = algorithm.init(KEY).replace(params=jnp.float32(optimum + offset))
-        _, info = update(state, pairs(demonstrated), pairs(sampled))
+        _, info = on_table(state, pairs(demonstrated), pairs(sampled))
         assert (info.gradient_norm < 1e-6) == vanishes
 
 
@@ -152,10 +152,9 @@ def test_descent_learns_to_tell_the_two_apart():
 
 
 def test_wrong_shapes_are_named():
-    algorithm = learner()
-    state, batch = algorithm.init(KEY), random_batch(KEY, 5)
+    state, batch = begun(), random_batch(KEY, 5)
     wrong = batch._replace(action=batch.action[:, 0])
     with pytest.raises(ValueError, match=r"demonstrations: expected actions \[B, 1\]"):
-        algorithm.update(state, wrong, batch)
+        ALGORITHM.update(state, wrong, batch)
     with pytest.raises(ValueError, match="background: expected actions"):
-        algorithm.update(state, batch, wrong)
+        ALGORITHM.update(state, batch, wrong)

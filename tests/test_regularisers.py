@@ -62,7 +62,7 @@ def test_the_output_penalty_is_the_mean_square_of_what_the_mask_leaves():
     assert regularisers.output_penalty(VALUES, NOTHING) == 0
 
 
-@pytest.mark.parametrize("target", [0.0, 1.0])
+@pytest.mark.parametrize("target", [0.0, 0.7])
 @pytest.mark.parametrize("mask", [MASK, ~NOTHING])
 def test_the_gradient_penalty_and_its_gradient_are_those_of_a_known_function(mask, target):
     found = penalty(SLOPES, mask, target)
