@@ -34,7 +34,8 @@ class BackgroundState(flax.struct.PyTreeNode):
 
     Attributes:
         log_density: `[C]`, of each of the replay's actions as it was drawn.
-        snapshots: actor parameters `[K, ...]`, one for every `snapshot_period` steps.
+        snapshots: actor parameters `[K, ...]`, one for every `snapshot_period` steps. Each explores
+            as it did at the step at which it was taken.
         episodes: an `EpisodesState`, where the latest episodes lie in the replay.
         demonstrator: the demonstrations' behaviour as a `ConditionalGaussian`, an approximation.
     """
@@ -191,14 +192,17 @@ def make(
     ) -> jax.Array:
         """Of the snapshots, and of the demonstrator in the share that it has of the samples."""
 
-        def of_snapshot(actor: Params) -> jax.Array:
+        def of_snapshot(actor: Params, step: jax.Array) -> jax.Array:
             greedy = networks_lib.policy(networks, actor, sampled.transition.observation)
             return exploration.log_density(
-                exploration_state, greedy, sampled.transition.action, count
+                exploration_state, greedy, sampled.transition.action, step
             )
 
-        each = jax.vmap(of_snapshot)(state.snapshots)
-        filled = jnp.arange(schedule.snapshots) * schedule.snapshot_period < count
+        # The slots hold the latest snapshots up to number `latest`; a negative number is none yet.
+        latest = (count - 1) // schedule.snapshot_period
+        number = latest - (latest - jnp.arange(schedule.snapshots)) % schedule.snapshots
+        filled = number >= 0
+        each = jax.vmap(of_snapshot)(state.snapshots, number * schedule.snapshot_period)
         if whole:
             mean = densities.trajectory_mixture(each, sampled.mask, filled)
         else:

@@ -123,7 +123,7 @@ def make(
 def log_likelihood(
     demonstrations: tuple[jax.Array, jax.Array], background: tuple[jax.Array, jax.Array]
 ) -> jax.Array:
-    """mean_D log D + mean_B log(1 - D), `[]` (Ho and Ermon 2016, Eq. 14, signs turned round).
+    """mean_D log D + mean_B log(1 - D), `[]` (Ho and Ermon 2016, Eq. 14, whose D is this 1 - D).
 
     Args:
         demonstrations: logits of D `[D]`, and their mask.

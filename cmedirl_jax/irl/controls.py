@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from cmedirl_jax import rewards
 from cmedirl_jax.irl import base, regularisers
@@ -47,18 +48,24 @@ def random(
     Args:
         spec: whose bounds must be finite.
         hparams: of which the bound and its kind are read.
-        network: default `rewards.mlp(spec)`.
+        network: default `rewards.mlp(spec)`; its parameters are drawn such that it varies.
+
+    Raises:
+        ValueError: if a bound is infinite.
     """
+    if not all(np.isfinite(bound).all() for bound in _bounds(spec)):
+        raise ValueError(f"{spec.id}: uniform pairs need finite bounds, got {_bounds(spec)}")
     hparams = hparams or IRLHParams()
     network = network or rewards.mlp(spec)
 
     def init(key: jax.Array) -> RewardState:
         network_key, observation_key, action_key = jax.random.split(key, 3)
         params = network.init(network_key)
+        observation_low, observation_high, action_low, action_high = _bounds(spec)
         output = network.apply(
             params,
-            _uniform(observation_key, spec.observation_low, spec.observation_high),
-            _uniform(action_key, spec.action_low, spec.action_high),
+            _uniform(observation_key, observation_low, observation_high),
+            _uniform(action_key, action_low, action_high),
         )
         standardised = RandomParams(params, jnp.mean(output), jnp.std(output))
         return RewardState(standardised, (), base.traced(hparams))
@@ -69,6 +76,10 @@ def random(
         return regularisers.bounded(output, state.hparams.bound, state.hparams.bounded_by)
 
     return RewardLearner(init, reward, base.learn_nothing)
+
+
+def _bounds(spec: EnvSpec) -> tuple[np.ndarray, ...]:
+    return spec.observation_low, spec.observation_high, spec.action_low, spec.action_high
 
 
 def _uniform(key: jax.Array, low, high) -> jax.Array:

@@ -100,7 +100,7 @@ def gauge_offset(
     demonstrations: tuple[jax.Array, jax.Array],
     background: tuple[jax.Array, jax.Array],
 ) -> jax.Array:
-    """The constant that the gauge takes off r_D, `[]`, on a batch of each.
+    """The constant that the gauge takes off r_D, `[]`, on a batch of each; 0 on an empty one.
 
     - "none": 0.
     - "zero-mean": the mean of r_D over the background.
@@ -119,7 +119,8 @@ def gauge_offset(
             return masked_mean(*background)
         case "demonstration-maximum":
             reward, mask = demonstrations
-            return jnp.max(reward, initial=-jnp.inf, where=mask)
+            largest = jnp.max(reward, initial=-jnp.inf, where=mask)
+            return jnp.where(jnp.any(mask), largest, 0.0)
 
 
 def absorbed_reward(absorbing: jax.Array, terminated: jax.Array, discount: Numeric) -> jax.Array:
@@ -131,7 +132,7 @@ def absorbed_reward(absorbing: jax.Array, terminated: jax.Array, discount: Numer
     Args:
         absorbing: `[]`, r_D of the absorbing state.
         terminated: `[...]` bool.
-        discount: the agent's.
+        discount: the agent's, below 1.
     """
     return jnp.where(terminated, discount / (1.0 - discount) * absorbing, 0.0)
 
