@@ -64,8 +64,7 @@ def compose(spec: EnvSpec, method: Method, settings: Settings, capacity: int) ->
             objective=hparams.objective if method.reward == "maxent" else "visitation",
             append=hparams.append_demonstrations,
         )
-    if method.reward is not None and shaping == "potential":
-        _check_potential(method, settings)
+    _check_reward(method, settings, shaping)
     return Algorithm(
         agent=agent,
         learner=make_learner(spec, method, settings, shaping),
@@ -130,13 +129,19 @@ def _check_weights(settings: Settings) -> None:
         )
 
 
-def _check_potential(method: Method, settings: Settings) -> None:
-    if method.tabular is not None and settings.tabular.reward != "state":
+def _check_reward(method: Method, settings: Settings, shaping: Shaping) -> None:
+    potential, absorbing = shaping == "potential", settings.reward.absorbing
+    if potential and method.tabular is not None and settings.tabular.reward != "state":
+        raise ValueError("a potential is a function of the state: take tabular.reward state")
+    if method.reward == "maxent" and absorbing and potential:
         raise ValueError(
-            f"a potential is a function of the state: {method.name} needs tabular.reward state"
+            "a potential is 0 past termination: take reward.absorbing False, or another "
+            "reward_schedule.shaping"
         )
-    if method.reward == "maxent" and settings.reward.absorbing:
-        raise ValueError("a potential is 0 past termination: it has no absorbing reward")
+    if method.reward == "maxent" and absorbing and settings.agent.discount >= 1.0:
+        raise ValueError("an absorbing state for ever needs an agent.discount below 1")
+    if method.reward == "random" and settings.reward_network.kind != "deep":
+        raise ValueError("a linear reward starts at zero: take reward_network.kind deep")
 
 
 def make_exploration(

@@ -1,10 +1,14 @@
 import dataclasses
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from cmedirl_jax import composition, envs, methods, training
-from cmedirl_jax.methods import METHODS, ExplorationSettings, Settings
-from cmedirl_jax.schedules import Schedule
+from cmedirl_jax.exploration import EpsilonGreedyHParams
+from cmedirl_jax.methods import METHODS, ExplorationSettings, RewardNetworkSettings, Settings
+from cmedirl_jax.schedules import RewardSchedule, Schedule
 
 SPEC = envs.make("MountainCarContinuous-v0").spec
 
@@ -80,3 +84,67 @@ def test_only_hot_started_methods_scale_their_noise(kind, scaled):
     for name, factor in (("ddpg", 1.0), ("hs-ddpg", 0.25)):
         found = hparams(composition.compose(SPEC, METHODS[name], composed, capacity=10).exploration)
         assert found == {k: pytest.approx(factor * v if k in scaled else v) for k, v in own.items()}
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "named"),
+    [
+        (
+            "me-ddpg",
+            {"reward_schedule": {"shaping": "potential"}, "reward": {"absorbing": True}},
+            "reward.absorbing False",
+        ),
+        ("me-ddpg", {"agent": {"discount": 1.0}, "reward": {"absorbing": True}}, "agent.discount"),
+        ("tabular-me-ddpg", {"reward_schedule": {"shaping": "potential"}}, "tabular.reward state"),
+        ("random-reward", {"reward_network": {"kind": "fourier"}}, "reward_network.kind deep"),
+        ("me-ddpg", {"reward": {"bound": float("inf")}}, 'bounded_by "none"'),
+        (
+            "me-ddpg",
+            {
+                "exploration": {"kind": "epsilon-greedy"},
+                "reward_schedule": {"weights": "fusion"},
+            },
+            "epsilon_greedy.noise",
+        ),
+        (
+            "me-ddpg",
+            {
+                "exploration": {
+                    "kind": "epsilon-greedy",
+                    "epsilon_greedy": EpsilonGreedyHParams(hold=4.0, noise=0.1),
+                },
+                "reward": {"objective": "trajectory"},
+                "reward_schedule": {"weights": "recorded"},
+            },
+            "epsilon_greedy.hold 1",
+        ),
+    ],
+)
+def test_parts_that_do_not_fit_each_other_are_refused_naming_the_option(name, changes, named):
+    groups = {
+        group: dataclasses.replace(getattr(Settings(), group), **fields)
+        for group, fields in changes.items()
+    }
+    settings = dataclasses.replace(Settings(), **groups)
+    with pytest.raises(ValueError, match=named):
+        composition.compose(SPEC, METHODS[name], settings, capacity=10)
+
+
+@pytest.mark.parametrize("kind", ["deep", "radial-basis", "fourier"])
+def test_a_potential_is_a_function_of_the_state_whatever_the_network(kind):
+    settings = dataclasses.replace(
+        Settings(),
+        reward_network=RewardNetworkSettings(kind=kind, hidden=(4,), centres=3),
+        reward_schedule=RewardSchedule(shaping="potential"),
+    )
+    learner = composition.compose(SPEC, METHODS["me-ddpg"], settings, capacity=10).learner
+    state = learner.init(jax.random.key(0))
+    state = state.replace(
+        params=jax.tree.map(
+            lambda leaf: leaf + jnp.linspace(0.1, 0.5, leaf.size).reshape(leaf.shape), state.params
+        )
+    )
+    observation = jnp.array([[-0.5, 0.01], [0.2, 0.0]])
+    potential, other = (learner.reward(state, observation, a * jnp.ones((2, 1))) for a in (-1, 1))
+    np.testing.assert_array_equal(potential, other)
+    assert potential[0] != potential[1]
