@@ -104,7 +104,15 @@ def make(
         schedule: which weights, how many snapshots and episodes.
         objective: of the learner: pairs or trajectories.
         append: whether the demonstrations join the samples, and so the mixture they are drawn from.
+
+    Raises:
+        ValueError: if the schedule's `snapshots`, `snapshot_period` or `episodes` are not positive.
     """
+    if min(schedule.snapshots, schedule.snapshot_period) < 1:
+        raise ValueError(
+            "snapshots and snapshot_period must be positive, "
+            f"got {schedule.snapshots} and {schedule.snapshot_period}"
+        )
     whole = objective == "trajectory"
     recorded, fused = (schedule.weights == kind for kind in ("recorded", "fusion"))
     ring = episodes_lib.make(schedule.episodes, capacity, spec.max_episode_steps)

@@ -330,3 +330,11 @@ def test_seeds_in_step_keep_their_own_and_the_snapshot_stays_a_branch():
         assert not leaf[:, [0, 2]].any()
     np.testing.assert_array_equal(states.episodes.count, [1, 0])
     np.testing.assert_array_equal(states.episodes.length[:, 0], [PERIOD + 1, 0])
+
+
+@pytest.mark.parametrize("name", ["snapshots", "snapshot_period", "episodes"])
+def test_numbers_must_be_positive(name):
+    schedule = RewardSchedule(**{name: 0})
+    parts = SPEC, NETWORKS, BEHAVIOURS["epsilon-greedy"], REPLAY, CAPACITY
+    with pytest.raises(ValueError, match="must be positive"):
+        background.make(*parts, schedule, objective="trajectory", append=True)
