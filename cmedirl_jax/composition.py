@@ -135,7 +135,7 @@ def _check_reward(method: Method, settings: Settings, shaping: Shaping) -> None:
         raise ValueError("a potential is a function of the state: take tabular.reward state")
     if method.reward == "maxent" and absorbing and potential:
         raise ValueError(
-            "a potential is 0 past termination: take reward.absorbing False, or another "
+            "a potential is 0 past termination: leave reward.absorbing, or take another "
             "reward_schedule.shaping"
         )
     if method.reward == "maxent" and absorbing and settings.agent.discount >= 1.0:

@@ -92,7 +92,7 @@ def test_only_hot_started_methods_scale_their_noise(kind, scaled):
         (
             "me-ddpg",
             {"reward_schedule": {"shaping": "potential"}, "reward": {"absorbing": True}},
-            "reward.absorbing False",
+            "leave reward.absorbing",
         ),
         ("me-ddpg", {"agent": {"discount": 1.0}, "reward": {"absorbing": True}}, "agent.discount"),
         ("tabular-me-ddpg", {"reward_schedule": {"shaping": "potential"}}, "tabular.reward state"),

@@ -4,7 +4,9 @@ from pathlib import Path
 import pytest
 
 from cmedirl_jax import composition, envs
-from cmedirl_jax.methods import METHODS, Settings
+from cmedirl_jax.irl import IRLHParams
+from cmedirl_jax.methods import METHODS, RewardNetworkSettings, Settings
+from cmedirl_jax.schedules import RewardSchedule
 from experiments import planning
 from experiments.presets import PRESETS
 from experiments.run_grid import parse
@@ -146,3 +148,33 @@ def test_what_tyro_finds_keeps_its_form(arguments, capsys):
 def test_the_librarys_defaults_are_the_tuned_preset():
     """What the learning tests train is what the command trains."""
     assert PRESETS["tuned"].settings == Settings()
+
+
+def test_everything_about_the_learned_reward_has_a_dotted_name():
+    grid = parse(
+        [
+            *("--methods", "me-ddpg", "gail"),
+            *("--reward.objective", "transition", "--reward.gradient-penalty", "0.5"),
+            *("--reward.bounded-by", "clip", "--reward.gauge", "zero-mean"),
+            *("--reward.absorbing", "--reward.weight-limit", "4"),
+            *("--reward-schedule.weights", "fusion", "--reward-schedule.shaping", "alone"),
+            *("--reward-network.kind", "fourier", "--reward-network.inputs", "state"),
+            *("--gail.form", "logit D", "--exploration.epsilon-greedy.noise", "0.2"),
+        ]
+    )
+    settings = grid.settings
+    assert settings.reward == IRLHParams(
+        objective="transition",
+        gradient_penalty=0.5,
+        bounded_by="clip",
+        gauge="zero-mean",
+        absorbing=True,
+        weight_limit=4.0,
+    )
+    schedule = RewardSchedule(weights="fusion", shaping="alone")
+    assert settings.reward_schedule == schedule
+    network = RewardNetworkSettings(kind="fourier", inputs="state")
+    assert settings.reward_network == network
+    assert settings.gail.form == "logit D"
+    assert settings.exploration.epsilon_greedy.noise == 0.2
+    planning.check(grid)

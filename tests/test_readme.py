@@ -1,4 +1,4 @@
-"""The README's commands and code are what it says they are."""
+"""The commands and the code of README and docs are what they say they are."""
 
 import re
 from pathlib import Path
@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import pytest
 
 README = Path(__file__).parent.parent / "README.md"
+METHOD = README.parent / "docs" / "method.md"
 
 
-def blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", README.read_text(), flags=re.DOTALL)
+def blocks(page):
+    return re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
 
 
 def test_the_quick_start_is_two_one_line_commands():
@@ -23,10 +24,10 @@ def test_the_quick_start_is_two_one_line_commands():
     assert "python -m pytest\n" in commands[1]
 
 
-@pytest.mark.parametrize("code", blocks("python"), ids=lambda code: code.splitlines()[0])
+@pytest.mark.parametrize("code", [*blocks(README), *blocks(METHOD)])
 def test_the_examples_run(code):
     names = {}
-    exec(compile(code, str(README), "exec"), names)
+    exec(compile(code, "<example>", "exec"), names)
     arrays = [leaf for leaf in jax.tree.leaves(list(names.values())) if isinstance(leaf, jax.Array)]
     numbers = [leaf for leaf in arrays if jnp.issubdtype(leaf.dtype, jnp.floating)]
     assert numbers
@@ -34,4 +35,5 @@ def test_the_examples_run(code):
 
 
 def test_there_are_examples():
-    assert len(blocks("python")) >= 2
+    assert len(blocks(README)) >= 2
+    assert len(blocks(METHOD)) == 1

@@ -34,14 +34,16 @@ def cell(method, n_demos, episodes=3):
 
 
 def test_configuration_is_strict_json_with_versions(tmp_path):
-    grid = dataclasses.replace(PRESETS["paper"], out=tmp_path)
-    assert math.isinf(grid.settings.reward.weight_limit)
+    settings = dataclasses.replace(
+        PRESETS["paper"].settings, reward=IRLHParams(gauge_rate=math.inf)
+    )
+    grid = dataclasses.replace(PRESETS["paper"], out=tmp_path, settings=settings)
     text = (results.open_folder(grid) / "config.json").read_text()
     written = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert written["schema"] == results.SCHEMA
     assert written["versions"]["jax"] == jax.__version__
     assert written["config"]["n_demos"] == [200]
-    assert written["config"]["settings"]["reward"]["weight_limit"] == "inf"
+    assert written["config"]["settings"]["reward"]["gauge_rate"] == "inf"
     assert written["config"]["settings"]["hot_start"]["critic"] == "softmax"
 
 
@@ -63,7 +65,7 @@ def test_the_same_configuration_enters_again_and_changes_nothing(preset, tmp_pat
         ({"demos": Path(__file__)}, f"--demos None, not {__file__};"),
         (
             {"settings": Settings(reward=IRLHParams(weight_limit=5.0))},
-            "--reward.weight-limit inf, not 5.0;",
+            "--reward.weight-limit None, not 5.0;",
         ),
     ],
 )

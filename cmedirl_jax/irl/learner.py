@@ -43,8 +43,8 @@ class IRLHParams(flax.struct.PyTreeNode):
     """Discount of a trajectory's return; only 1 makes its optimum that of `tabular.maxent`."""
     weight_exponent: float = 1.0
     """Exponent of importance weights: 1 as they are, 0 uniform."""
-    weight_limit: float = float("inf")
-    """Largest distance of an importance weight's logarithm from the batch's mean."""
+    weight_limit: float | None = None
+    """Largest distance of an importance weight's logarithm from the batch's mean; None: any."""
     objective: Objective = flax.struct.field(pytree_node=False, default="visitation")
     """How E[mu] is estimated, see `irl.objectives`; the last takes trajectories."""
     bounded_by: BoundKind = flax.struct.field(pytree_node=False, default="tanh")

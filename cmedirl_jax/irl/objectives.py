@@ -99,7 +99,11 @@ def returns(reward: jax.Array, mask: jax.Array, discount: Numeric = 1.0) -> jax.
 
 
 def log_weights(
-    log_density: jax.Array, mask: jax.Array, *, exponent: Numeric = 1.0, limit: Numeric = jnp.inf
+    log_density: jax.Array,
+    mask: jax.Array,
+    *,
+    exponent: Numeric = 1.0,
+    limit: Numeric | None = None,
 ) -> jax.Array:
     """log z of samples of a given log density, tempered and clipped: `[B]` -> `[B]`.
 
@@ -110,13 +114,14 @@ def log_weights(
         log_density: with respect to the base measure; +inf gives weight 0.
         mask: which samples count.
         exponent: z^exponent in place of z; 0 gives uniform weights.
-        limit: largest distance of log z^exponent from its mean.
+        limit: largest distance of log z^exponent from its mean; None for any.
     """
     counts = mask & jnp.isfinite(log_density)
     log_z = -exponent * jnp.where(counts, log_density, 0.0)
-    centre = jnp.sum(jnp.where(counts, log_z, 0.0)) / jnp.maximum(jnp.sum(counts), 1)
-    clipped = jnp.clip(log_z, centre - limit, centre + limit)
-    return jnp.where(jnp.isposinf(log_density), -jnp.inf, clipped)
+    if limit is not None:
+        centre = jnp.sum(jnp.where(counts, log_z, 0.0)) / jnp.maximum(jnp.sum(counts), 1)
+        log_z = jnp.clip(log_z, centre - limit, centre + limit)
+    return jnp.where(jnp.isposinf(log_density), -jnp.inf, log_z)
 
 
 def _log_partition_likelihood(
