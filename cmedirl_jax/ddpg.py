@@ -15,6 +15,7 @@ import optax
 
 from cmedirl_jax import checks, optimizers
 from cmedirl_jax import networks as networks_lib
+from cmedirl_jax.hparams import traced
 from cmedirl_jax.networks import ActorCritic
 from cmedirl_jax.types import EnvSpec, Numeric, Params, Transition
 
@@ -160,7 +161,7 @@ def make(
             target_critic=jax.tree.map(jnp.copy, critic),
             actor_optimizer=actor_tx.init(actor),
             critic_optimizer=critic_tx.init(critic),
-            hparams=jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams),
+            hparams=traced(hparams),
         )
 
     def act(state: DDPGState, observation: jax.Array) -> jax.Array:

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmedirl_jax.hparams import traced
 from cmedirl_jax.irl import densities
 from cmedirl_jax.types import EnvSpec, Numeric
 
@@ -116,7 +117,7 @@ def gaussian(spec: EnvSpec, hparams: GaussianHParams | None = None) -> Explorati
         return densities.clipped_normal(spec, greedy, state.scale * _half_width(spec), action)
 
     return _exploration(
-        init=lambda key: _traced(hparams),
+        init=lambda key: traced(hparams),
         reset=lambda state: state,
         draw=lambda key: jax.random.normal(key, (spec.action_dim,)),
         perturb=perturb,
@@ -137,7 +138,7 @@ def ornstein_uhlenbeck(
 
     def init(key: jax.Array) -> OrnsteinUhlenbeckState:
         del key
-        return OrnsteinUhlenbeckState(jnp.zeros(spec.action_dim), _traced(hparams))
+        return OrnsteinUhlenbeckState(jnp.zeros(spec.action_dim), traced(hparams))
 
     def perturb(state: OrnsteinUhlenbeckState, action: jax.Array, noise: jax.Array, step: Numeric):
         del step
@@ -180,7 +181,7 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
 
     def init(key: jax.Array) -> HeldActionState:
         del key
-        return HeldActionState(jnp.zeros(spec.action_dim), jnp.zeros(()), _traced(hparams))
+        return HeldActionState(jnp.zeros(spec.action_dim), jnp.zeros(()), traced(hparams))
 
     def draw(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None]:
         keys = jax.random.split(key, 2 if hparams.noise is None else 3)
@@ -238,11 +239,6 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
 def _epsilon(hparams: EpsilonGreedyHParams, step: Numeric) -> jax.Array:
     progress = jnp.clip(step / hparams.epsilon_steps, 0.0, 1.0)
     return hparams.epsilon_start + progress * (hparams.epsilon_end - hparams.epsilon_start)
-
-
-def _traced(hparams: Any) -> Any:
-    """Hyperparameters as float32 arrays, so that a state has one type whoever made it."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams)
 
 
 def _half_width(spec: EnvSpec) -> jax.Array:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from cmedirl_jax import optimizers, rewards
+from cmedirl_jax.hparams import traced
 from cmedirl_jax.irl import base, regularisers
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.types import EnvSpec, Network, Params, RewardBatch, Transition
@@ -54,7 +55,7 @@ def make(
 
     def init(key: jax.Array) -> RewardState:
         params = network.init(key)
-        return RewardState(params, tx.init(params), base.traced(hparams))
+        return RewardState(params, tx.init(params), traced(hparams))
 
     def of_logit(logit: jax.Array, hparams: GAILHParams) -> jax.Array:
         match hparams.form:

@@ -87,11 +87,6 @@ class RewardLearner(NamedTuple):
     absorbing: Callable[[RewardState], jax.Array] | None = None
 
 
-def traced(hparams: Any) -> Any:
-    """Hyperparameters as float32 arrays, so that a state has one type whoever made it."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams)
-
-
 def learn_nothing(
     state: RewardState,
     demonstrations: Transition | RewardBatch,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax import rewards
+from cmedirl_jax.hparams import traced
 from cmedirl_jax.irl import base, regularisers
 from cmedirl_jax.irl.base import RewardLearner, RewardState
 from cmedirl_jax.irl.learner import IRLHParams
@@ -68,7 +69,7 @@ def random(
             _uniform(action_key, action_low, action_high),
         )
         standardised = RandomParams(params, jnp.mean(output), jnp.std(output))
-        return RewardState(standardised, (), base.traced(hparams))
+        return RewardState(standardised, (), traced(hparams))
 
     def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
         params, mean, deviation = state.params

@@ -14,6 +14,7 @@ import numpy as np
 import optax
 
 from cmedirl_jax import optimizers, rewards
+from cmedirl_jax.hparams import traced
 from cmedirl_jax.irl import base, objectives, regularisers
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.irl.objectives import Likelihood, Objective, Scored
@@ -110,7 +111,7 @@ def make(
         absorbing = jnp.zeros(()) if hparams.absorbing else None
         params = RewardParams(network.init(key), jnp.zeros(()), absorbing)
         learned: Any = (params.network, params.absorbing)
-        return RewardState(params, tx.init(learned), base.traced(hparams))
+        return RewardState(params, tx.init(learned), traced(hparams))
 
     def bounded(output: jax.Array, hparams: IRLHParams) -> jax.Array:
         return regularisers.bounded(output, hparams.bound, hparams.bounded_by)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax.hparams import traced
 from cmedirl_jax.irl import IRLHParams, RewardLearner, RewardState, base
 from cmedirl_jax.tabular import interpolation
 from cmedirl_jax.tabular.interpolation import Grid
@@ -43,4 +44,4 @@ def state(table: jax.Array, hparams: IRLHParams) -> RewardState:
     """
     largest = jnp.max(jnp.abs(table))
     scaled = hparams.bound * table / jnp.where(largest > 0, largest, 1.0)
-    return RewardState(scaled, (), base.traced(hparams))
+    return RewardState(scaled, (), traced(hparams))
