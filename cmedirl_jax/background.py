@@ -90,8 +90,8 @@ def make(
     capacity: int,
     schedule: RewardSchedule,
     *,
-    objective: Objective,
-    append: bool,
+    objective: Objective = "visitation",
+    append: bool = True,
 ) -> Background:
     """Make the samples of a reward learner.
 
@@ -150,13 +150,12 @@ def make(
             )
         if fused:
             slot = step // schedule.snapshot_period % schedule.snapshots
-            snapshots = jax.lax.cond(
-                step % schedule.snapshot_period == 0,
-                lambda snapshots: jax.tree.map(
-                    lambda kept, leaf: kept.at[slot].set(leaf), snapshots, actor
-                ),
-                lambda snapshots: snapshots,
+            due = step % schedule.snapshot_period == 0
+            # One slot is written at every step: a branch would copy all of them.
+            snapshots = jax.tree.map(
+                lambda kept, leaf: kept.at[slot].set(jnp.where(due, leaf, kept[slot])),
                 state.snapshots,
+                actor,
             )
             state = state.replace(snapshots=snapshots)
         if whole:
@@ -181,7 +180,9 @@ def make(
         start, length = (leaf[draws.demonstrations, None] for leaf in subset)
         last = jnp.shape(pool.reward)[0] - 1
         episodes = demonstrations_lib.at(pool, jnp.minimum(start + time, last))
-        rows, mask = ring.take(state.episodes, draws.background, replay_state.count)
+        rows, mask = ring.take(
+            state.episodes, draws.background, replay_state.count, schedule.recent
+        )
         return _Sampled(episodes, time < length, None), _Sampled(
             replay.at(replay_state, rows), mask, rows
         )

@@ -3,7 +3,16 @@
 import dataclasses
 from typing import NamedTuple
 
-from cmedirl_jax import background, ddpg, exploration, irl, networks, replay, rewards
+from cmedirl_jax import (
+    background,
+    compatibility,
+    ddpg,
+    exploration,
+    irl,
+    networks,
+    replay,
+    rewards,
+)
 from cmedirl_jax.background import Background
 from cmedirl_jax.ddpg import DDPG
 from cmedirl_jax.exploration import Exploration
@@ -47,24 +56,23 @@ def compose(spec: EnvSpec, method: Method, settings: Settings, capacity: int) ->
     behaviour = make_exploration(spec, settings.exploration, hot_start=method.hot_start)
     capacity = settings.schedule.replay_capacity or capacity
     buffer = replay.make(spec, capacity)
+    compatibility.check(spec, method, settings, shaping, capacity)
     samples = None
-    if method.learns_reward:
-        if method.reward == "maxent":
-            _check_weights(settings)
+    if method.reward == "maxent":
         samples = background.make(
             spec,
             agent.networks,
             behaviour,
             buffer,
             capacity,
-            # A discriminator is trained on the pairs as they come.
-            schedule
-            if method.reward == "maxent"
-            else dataclasses.replace(schedule, weights="uniform"),
-            objective=hparams.objective if method.reward == "maxent" else "visitation",
+            schedule,
+            objective=hparams.objective,
             append=hparams.append_demonstrations,
         )
-    _check_reward(method, settings, shaping)
+    elif method.learns_reward:
+        # A discriminator is trained on the pairs as they come.
+        pairs = dataclasses.replace(schedule, weights="uniform")
+        samples = background.make(spec, agent.networks, behaviour, buffer, capacity, pairs)
     return Algorithm(
         agent=agent,
         learner=make_learner(spec, method, settings, shaping),
@@ -110,38 +118,6 @@ def reward_network(
             return rewards.linear(spec, rewards.radial_basis(spec, settings.centres, inputs))
         case "fourier":
             return rewards.linear(spec, rewards.fourier(spec, settings.order, inputs))
-
-
-def _check_weights(settings: Settings) -> None:
-    if settings.exploration.kind != "epsilon-greedy":
-        return
-    weights, epsilon_greedy = settings.reward_schedule.weights, settings.exploration.epsilon_greedy
-    whole = settings.reward.objective == "trajectory"
-    if weights != "uniform" and whole and epsilon_greedy.hold > 1:
-        raise ValueError(
-            "a trajectory of held random actions has no density to weight it by: take "
-            "reward_schedule.weights uniform, or exploration.epsilon_greedy.hold 1"
-        )
-    if epsilon_greedy.noise is None and (weights == "fusion" or (weights != "uniform" and whole)):
-        raise ValueError(
-            "a greedy action without noise has no density to weight it by: take "
-            "reward_schedule.weights uniform, or give exploration.epsilon_greedy.noise"
-        )
-
-
-def _check_reward(method: Method, settings: Settings, shaping: Shaping) -> None:
-    potential, absorbing = shaping == "potential", settings.reward.absorbing
-    if potential and method.tabular is not None and settings.tabular.reward != "state":
-        raise ValueError("a potential is a function of the state: take tabular.reward state")
-    if method.reward == "maxent" and absorbing and potential:
-        raise ValueError(
-            "a potential is 0 past termination: leave reward.absorbing, or take another "
-            "reward_schedule.shaping"
-        )
-    if method.reward == "maxent" and absorbing and settings.agent.discount >= 1.0:
-        raise ValueError("an absorbing state for ever needs an agent.discount below 1")
-    if method.reward == "random" and settings.reward_network.kind != "deep":
-        raise ValueError("a linear reward starts at zero: take reward_network.kind deep")
 
 
 def make_exploration(

@@ -36,9 +36,10 @@ class Episodes(NamedTuple):
         init: `() -> EpisodesState`, empty.
         step: `(state, step, done) -> EpisodesState`, after transition number `step` `[]` int32 was
             added to the replay; `done` `[]` bool, that it ended an episode.
-        take: `(state, bits [M], steps) -> (rows [M, T], mask [M, T])`: M of the ring's episodes,
-            uniform with replacement, as rows of the replay's storage, after `steps` transitions
-            were added. A mask that is False throughout stands for an episode that is not there.
+        take: `(state, bits [M], steps, recent=None) -> (rows [M, T], mask [M, T])`: M of the ring's
+            episodes, uniform with replacement, as rows of the replay's storage, after `steps`
+            transitions were added. With `recent`, of those that lie in so many latest transitions.
+            Where there is none, the mask is False throughout.
     """
 
     init: Callable[[], EpisodesState]
@@ -78,13 +79,16 @@ def make(capacity: int, replay_capacity: int, max_length: int) -> Episodes:
         )
 
     def take(
-        state: EpisodesState, bits: jax.Array, steps: jax.Array
+        state: EpisodesState, bits: jax.Array, steps: jax.Array, recent: int | None = None
     ) -> tuple[jax.Array, jax.Array]:
-        held = jnp.maximum(jnp.minimum(state.count, capacity), 1)
-        slot = (bits % held.astype(jnp.uint32)).astype(jnp.int32)
+        window = replay_capacity if recent is None else min(recent, replay_capacity)
+        whole = (state.length > 0) & (state.start >= steps - window)
+        # They are the latest ones, for starts only grow.
+        held = jnp.sum(whole)
+        age = (bits % jnp.maximum(held, 1).astype(jnp.uint32)).astype(jnp.int32)
+        slot = (state.count - 1 - age) % capacity
         start, length = state.start[slot, None], state.length[slot, None]
         time = jnp.arange(max_length)
-        whole = start >= steps - replay_capacity
-        return (start + time) % replay_capacity, (time < length) & whole
+        return (start + time) % replay_capacity, (time < length) & (held > 0)
 
     return Episodes(init, step, take)

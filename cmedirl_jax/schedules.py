@@ -28,24 +28,26 @@ class RewardSchedule:
     batch_size: int = 32
     """Demonstrated pairs per update, and background pairs per update."""
     recent: int | None = 2000
-    """Background: the latest transitions of the replay; None: all collected so far."""
+    """Background: the latest transitions of the replay, or the episodes that lie in them; None:
+    all collected so far."""
     storage: Literal["recompute", "store"] = "recompute"
     """Compute r_D anew when a transition is sampled, or store r* = r_D + r_e at collection."""
     shaping: Shaping | None = None
-    """How r_D joins r_e: r_e + r_D, r_e + gamma Phi(s') - Phi(s) with r_D(s) for Phi, or r_D
-    alone; None: as the method says."""
+    """How r_D joins r_e in a method that adds them: r_e + r_D, r_e + gamma Phi(s') - Phi(s) with
+    r_D(s) for Phi, or r_D alone; None: as the method says."""
     weights: Literal["uniform", "recorded", "fusion"] = "uniform"
-    """Weights of the samples: all alike, 1 / the density recorded when the action was drawn, or
-    1 / the mixture of snapshots of the policy and of the demonstrations' fitted Gaussian."""
+    """Weights of the samples of "maxent": all alike, 1 / the density recorded when the action was
+    drawn, or 1 / the mixture of snapshots of the policy and, where demonstrations are appended, of
+    their fitted Gaussian, in the same shares everywhere."""
     snapshots: int = 8
-    """Snapshots of the policy in the mixture, the latest ones."""
+    """Snapshots of the policy in the mixture, the latest ones; they must reach back as `recent`."""
     snapshot_period: int = 250
     """Environment steps between snapshots."""
     trajectories: int = 8
     """Demonstrated trajectories per update of the "trajectory" objective, and as many of the
     background. An update costs their steps, up to the time limit of each: take a long `period`."""
     episodes: int = 32
-    """Episodes of the background, the latest ones, that trajectories are drawn from."""
+    """Episodes of the background, the latest ones, that trajectories are drawn from at most."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -79,7 +79,7 @@ def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
             rows = demonstrations.sample_index(demonstrations_key, subset, pairs)
         chosen = rows[:sampled]
         if whole and subset is not None:
-            chosen = demonstrations.sample_episodes(demonstrations_key, subset, sampled)
+            chosen = demonstrations.sample_episodes(jax.random.fold_in(key, 4), subset, sampled)
         return Draws(
             batch=replay.draw(batch_key, agent_batch),
             reward=background.Draws(replay.draw(background_key, sampled), chosen),

@@ -1,7 +1,7 @@
 """`python -m experiments.compare FOLDER`: each cell of a run against one of them, seed by seed.
 
-Seeds are paired: seed i of every method starts from the same networks and draws the same noise. So
-the differences are of pairs, their intervals bootstrapped over pairs, their p-values from flipping
+Seeds are paired: seed i of every method draws the same networks, starts and noise. So the
+differences are of pairs, their intervals bootstrapped over pairs, their p-values from flipping
 the signs of pairs, adjusted for the number of cells by Holm's method.
 """
 
@@ -30,7 +30,7 @@ MEASURES: dict[str, Callable[[SeedStatistics, int], np.ndarray]] = {
     "area": lambda seeds, most: seeds.area,
     "final_return": lambda seeds, most: seeds.final_return,
 }
-"""What is compared; a seed that never converged counts as having done so at its last step."""
+"""What is compared; a seed that never converged counts as having done so at the last step."""
 
 RESAMPLES = 9_999
 
@@ -42,7 +42,8 @@ class Options:
     folder: Annotated[Path, tyro.conf.Positional]
     """A run's folder."""
     against: str = "ddpg"
-    """The method that every other is compared with."""
+    """The method that every other is compared with, at the same number of demonstrations where it
+    has several."""
     out: Path | None = None
     """A CSV file for the table."""
 
@@ -68,24 +69,32 @@ def compare(folder: Path, against: str) -> pl.DataFrame:
     """The paired differences of a finished run's cells to the cell of the method `against`.
 
     Raises:
-        UserError: if the folder holds no run, or not exactly one cell of that method, or no other.
+        UserError: if the folder holds no run, one whose cells end at different steps, a single
+            seed, no cell of that method, or none to compare with it.
     """
     path = folder / "config.json"
     if not path.exists() or results.read(folder, "evaluations") is None:
         raise UserError(f"{folder}: holds no finished cell of a run")
-    threshold = envs.make(json.loads(path.read_text())["config"]["env"]).spec.reward_threshold
+    config = json.loads(path.read_text())["config"]
+    if config["max_episodes"] is not None:
+        raise UserError(f"{folder}: a run over episodes, whose seeds end at different steps")
+    if config["seeds"] < 2:
+        raise UserError(f"{folder}: one seed has no interval")
+    threshold = envs.make(config["env"]).spec.reward_threshold
     cells = _seed_statistics(folder, threshold)
-    baseline = [cell for cell in cells if cell[0] == against]
-    if len(baseline) != 1:
+    references = {n_demos: seeds for (method, n_demos), seeds in cells.items() if method == against}
+    if not references:
         methods = ", ".join(sorted({method for method, _ in cells}))
-        raise UserError(
-            f"--against: {folder} must hold one cell of {against!r}, it holds {len(baseline)}; "
-            f"its methods are {methods}"
-        )
-    reference, most = cells.pop(baseline[0])
-    if not cells:
-        raise UserError(f"{folder}: holds no method beside {against}")
-    rows = []
+        raise UserError(f"--against: {folder} holds no {against!r}; its methods are {methods}")
+    pairs = {}
+    for (method, n_demos), seeds in cells.items():
+        only = next(iter(references.values())) if len(references) == 1 else None
+        reference = references.get(n_demos, only)
+        if method != against and reference is not None:
+            pairs[method, n_demos] = seeds, reference
+    if not pairs:
+        raise UserError(f"{folder}: holds no method beside {against} to compare with it")
+    most, rows = config["max_steps"], []
     for name, measure in MEASURES.items():
         found = [
             {
@@ -94,7 +103,7 @@ def compare(folder: Path, against: str) -> pl.DataFrame:
                 "measure": name,
                 **_paired(measure(seeds, most), measure(reference, most)),
             }
-            for (method, n_demos), (seeds, _) in cells.items()
+            for (method, n_demos), (seeds, reference) in pairs.items()
         ]
         adjusted = holm(np.array([row["p_value"] for row in found]))
         rows += [row | {"p_holm": p} for row, p in zip(found, adjusted, strict=True)]
@@ -110,10 +119,8 @@ def holm(p_values: np.ndarray) -> np.ndarray:
     return adjusted
 
 
-def _seed_statistics(
-    folder: Path, threshold: float
-) -> dict[tuple[str, int], tuple[SeedStatistics, int]]:
-    """Of every cell whose method acts: its seeds' statistics, and the last step evaluated."""
+def _seed_statistics(folder: Path, threshold: float) -> dict[tuple[str, int], SeedStatistics]:
+    """Of every cell whose method acts, its seeds' statistics."""
     evaluations, seeds = (results.read(folder, name) for name in ("evaluations", "seeds"))
     assert evaluations is not None
     assert seeds is not None
@@ -123,11 +130,8 @@ def _seed_statistics(
     }
     found = {}
     for key, group in evaluations.group_by(by_cell, maintain_order=True):
-        last = int(group["env_step"].max())  # type: ignore[arg-type]
-        if last > 0:
-            method, n_demos = key
-            columns = statistics.of_seeds(group, diverged[key], threshold)
-            found[str(method), int(n_demos)] = columns, last  # type: ignore[call-overload]
+        if group["env_step"].max() != 0:
+            found[key] = statistics.of_seeds(group, diverged[key], threshold)
     return found
 
 

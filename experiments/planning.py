@@ -89,9 +89,10 @@ def check(grid: Grid) -> None:
             rewards.radial_basis(env.spec, grid.settings.tabular.centres)
         except ValueError as error:
             raise UserError(f"--tabular: {error}") from error
+    capacity = budget_of(grid, env).max_steps
     for name in grid.methods:
         try:
-            composition.compose(env.spec, METHODS[name], grid.settings, capacity=1)
+            composition.compose(env.spec, METHODS[name], grid.settings, capacity)
         except ValueError as error:
             raise UserError(f"--methods {name}: {error}") from error
     if grid.demos is None:

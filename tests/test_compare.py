@@ -1,4 +1,5 @@
 import dataclasses
+import json
 
 import numpy as np
 import polars as pl
@@ -6,6 +7,7 @@ import pytest
 import scipy.stats
 
 from experiments import compare, results
+from experiments.errors import UserError
 from experiments.presets import PRESETS
 
 STEPS = np.array([0, 100, 200])
@@ -34,10 +36,16 @@ def cell(method, n_demos, curves, diverged=()):
     return {"evaluations": evaluations, "seeds": seeds, "episodes": seeds}
 
 
+def write_config(folder, **changes):
+    results.open_folder(
+        dataclasses.replace(PRESETS["smoke"], out=folder, seeds=SEEDS, max_steps=200, **changes)
+    )
+
+
 @pytest.fixture
 def folder(tmp_path):
     """Method b reaches 90 a hundred steps before a, but for a seed that never does."""
-    results.open_folder(dataclasses.replace(PRESETS["smoke"], out=tmp_path))
+    write_config(tmp_path)
     slow, fast, never = [0, 20, 95], [10, 95, 95], [0, 0, 0]
     results.append(tmp_path, cell("a", 0, [slow] * SEEDS))
     results.append(tmp_path, cell("b", 5, [*[fast] * (SEEDS - 1), never]))
@@ -69,6 +77,38 @@ def test_differences_are_of_pairs_of_seeds(folder):
     assert same["p_value"].to_list() == [1.0] * 3
 
 
+def test_a_diverged_seed_stands_at_its_lowest_return(folder):
+    results.append(folder, cell("d", 5, [*[[0, 20, 95]] * (SEEDS - 1), [30, 95]], diverged=[5]))
+    table = compare.compare(folder, "a").filter(pl.col("method") == "d")
+    difference = dict(table.select("measure", "difference").iter_rows())
+    assert difference["final_return"] == pytest.approx((30 - 95) / SEEDS)
+    assert difference["area"] == pytest.approx(((30 + 95 + 30) - 115) / 3 / SEEDS)
+
+
+def test_cells_are_compared_at_their_own_number_of_demonstrations(folder):
+    results.append(folder, cell("b", 7, [[0, 0, 95]] * SEEDS))
+    results.append(folder, cell("c", 7, [[0, 0, 95]] * SEEDS))
+    table = compare.compare(folder, "b").filter(pl.col("measure") == "convergence_env_step")
+    found = {
+        tuple(row[:2]): row[2] for row in table.select("method", "n_demos", "difference").rows()
+    }
+    assert found == {("c", 5): pytest.approx(100 * (SEEDS - 1) / SEEDS), ("c", 7): 0.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "named"), [({"max_episodes": 3}, "over episodes"), ({"seeds": 1}, "one seed")]
+)
+def test_runs_without_paired_curves_are_refused(tmp_path, change, named):
+    write_config(tmp_path)
+    path = tmp_path / "config.json"
+    written = json.loads(path.read_text())
+    written["config"] |= change
+    path.write_text(json.dumps(written))
+    results.append(tmp_path, cell("ddpg", 0, [[0, 20, 95]]))
+    with pytest.raises(UserError, match=named):
+        compare.compare(tmp_path, "ddpg")
+
+
 def test_holms_p_values_are_stepwise():
     found = compare.holm(np.array([0.01, 0.04, 0.03, 0.005]))
     np.testing.assert_allclose(found, [0.03, 0.06, 0.06, 0.02])
@@ -92,7 +132,8 @@ def test_the_command_prints_and_writes_the_table(folder, tmp_path, capsys):
     ("arguments", "named"),
     [
         (["nowhere"], "nowhere: holds no finished cell"),
-        (["{folder}", "--against", "ddpg"], "must hold one cell of 'ddpg', it holds 0"),
+        (["{folder}", "--against", "ddpg"], "holds no 'ddpg'; its methods are a, b, c"),
+        (["{folder}", "--against", "never-acts"], "holds no 'never-acts'"),
     ],
 )
 def test_mistakes_are_refused_in_a_line(folder, arguments, named, capsys):

@@ -17,7 +17,7 @@ BITS = np.random.default_rng(0).integers(0, 2**32, 20_000, dtype=np.uint32)
 @functools.cache
 def jitted(capacity, replay_capacity):
     ring = episodes.make(capacity, replay_capacity, MAX_LENGTH)
-    take = jax.jit(ring.take)
+    take = jax.jit(ring.take, static_argnums=3)
     # Under `vmap` the step is what all seeds share.
     together = jax.jit(jax.vmap(ring.step, in_axes=(0, None, 0)))
     return ring._replace(step=jax.jit(ring.step), take=take), together
@@ -62,7 +62,7 @@ def test_what_is_taken_is_the_latest_episodes_or_nothing(lengths, running, sizes
     assert rows.max() < sizes[1]
     found = {tuple(stored[row] for row in np.asarray(rows[i])[mask[i]]) for i in range(100)}
     latest = finished[-sizes[0] :]
-    expected = {episode if set(episode) <= set(stored) else () for episode in latest}
+    expected = {episode for episode in latest if set(episode) <= set(stored)}
     assert found == (expected or {()})
     # The steps come first, the padding last.
     assert not np.any(mask[:, 1:] & ~mask[:, :-1])
@@ -83,6 +83,14 @@ def test_sampling_is_uniform_over_the_episodes_held(count):
     observed = np.unique(rows[:, 0], return_counts=True)[1]
     assert len(observed) == min(count, 3)
     assert scipy.stats.chisquare(observed).pvalue > 1e-3
+
+
+def test_only_episodes_within_the_recent_transitions_are_taken():
+    ring, _ = jitted(3, 50)
+    state = after(ring, lasting([4, 3, 2]))
+    for recent, longest in ((1, 0), (4, 2), (5, 3), (9, 4)):
+        _, mask = ring.take(state, BITS[:100], 9, recent)
+        assert mask.sum(axis=1).max() == longest
 
 
 def test_an_episode_goes_with_its_first_transition():

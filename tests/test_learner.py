@@ -80,6 +80,8 @@ def test_gradient_equals_finite_differences_of_a_float64_posterior(
         expected = (z / z.sum()) @ r if objective == "visitation" else log_mean_exp(r, z)
         prior = -0.5 * 0.2 * sum((leaf**2).sum() for leaf in jax.tree.leaves(learned))
         penalty = 0.3 * np.mean(np.concatenate(found) ** 2)
+        if absorbing:
+            penalty += 0.3 * learned[1] ** 2
         return -(on_demo.mean() - expected + prior) + penalty
 
     moved = jax.tree.map(jnp.subtract, before.params, after.params)
@@ -124,7 +126,7 @@ def test_trajectories_give_the_gradient_of_a_float64_posterior_absorbing_states_
         # The trajectory of length 0 is not there.
         r, z = np.r_[returns[0], returns[1][:2]], np.exp(-np.array([0.5, -0.3, 0.2, 0.5, -0.3]))
         value = returns[0].mean() - log_mean_exp(r, z)
-        return -value + 0.3 * np.mean(np.concatenate(squares))
+        return -value + 0.3 * (np.mean(np.concatenate(squares)) + learned[1] ** 2)
 
     moved = jax.tree.map(jnp.subtract, before.params, after.params)
     expected = reference.gradient(

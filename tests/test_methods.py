@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from cmedirl_jax import composition, envs, methods, training
-from cmedirl_jax.exploration import EpsilonGreedyHParams
+from cmedirl_jax.exploration import EpsilonGreedyHParams, GaussianHParams
 from cmedirl_jax.methods import METHODS, ExplorationSettings, RewardNetworkSettings, Settings
 from cmedirl_jax.schedules import RewardSchedule, Schedule
 
 SPEC = envs.make("MountainCarContinuous-v0").spec
+BIG = {"schedule": {"replay_capacity": 1000}}
 
 
 def test_the_papers_methods_are_the_four_combinations_of_its_two_parts():
@@ -97,7 +98,53 @@ def test_only_hot_started_methods_scale_their_noise(kind, scaled):
         ("me-ddpg", {"agent": {"discount": 1.0}, "reward": {"absorbing": True}}, "agent.discount"),
         ("tabular-me-ddpg", {"reward_schedule": {"shaping": "potential"}}, "tabular.reward state"),
         ("random-reward", {"reward_network": {"kind": "fourier"}}, "reward_network.kind deep"),
-        ("me-ddpg", {"reward": {"bound": float("inf")}}, 'bounded_by "none"'),
+        ("me-ddpg", {"reward": {"bound": float("inf")}}, "reward.bounded_by none"),
+        ("ddpg-plus-constant", {"reward": {"bound": float("nan")}}, "reward.bounded_by none"),
+        ("gail", {"reward_schedule": {"shaping": "additive"}}, "leave reward_schedule.shaping"),
+        ("irl-only", {"reward_schedule": {"anneal_steps": 9}}, "anneal_steps"),
+        (
+            "me-ddpg",
+            {"agent": {"bootstrap_at_termination": True}, "reward": {"absorbing": True}},
+            "bootstrap_at_termination",
+        ),
+        (
+            "me-ddpg",
+            {"reward": {"absorbing": True, "bounded_by": "none"}},
+            "another reward.bounded_by",
+        ),
+        ("me-ddpg", {"reward": {"objective": "trajectory"}}, "schedule.replay_capacity"),
+        (
+            "me-ddpg",
+            {"reward_schedule": {"weights": "fusion", "recent": None}},
+            "reward_schedule.recent 2000",
+        ),
+        (
+            "me-ddpg",
+            {
+                "reward": {"objective": "trajectory"},
+                "reward_schedule": {"weights": "fusion"},
+                **BIG,
+            },
+            "exploration.kind gaussian",
+        ),
+        (
+            "me-ddpg",
+            {
+                "exploration": {"kind": "gaussian", "gaussian": GaussianHParams(scale=0.0)},
+                "reward_schedule": {"weights": "recorded"},
+            },
+            "gaussian.scale above 0",
+        ),
+        (
+            "me-ddpg",
+            {
+                "exploration": {"kind": "epsilon-greedy"},
+                "reward": {"objective": "trajectory"},
+                "reward_schedule": {"weights": "recorded"},
+                **BIG,
+            },
+            "epsilon_greedy.noise",
+        ),
         (
             "me-ddpg",
             {
@@ -115,6 +162,7 @@ def test_only_hot_started_methods_scale_their_noise(kind, scaled):
                 },
                 "reward": {"objective": "trajectory"},
                 "reward_schedule": {"weights": "recorded"},
+                **BIG,
             },
             "epsilon_greedy.hold 1",
         ),

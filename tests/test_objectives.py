@@ -12,8 +12,6 @@ from cmedirl_jax.irl.objectives import Scored
 from cmedirl_jax.types import EnvSpec, Network, RewardBatch, Transition
 from tests import mdps
 
-PAIRWISE = (objectives.visitation, objectives.transition)
-
 
 def random_scored(rng, size, *, keep=0.7):
     """Rewards, weights (some of them zero) and a mask that keeps at least one entry."""
@@ -81,37 +79,51 @@ def as_jax(scored):
     return Scored(*map(jnp.asarray, scored))
 
 
-@pytest.mark.parametrize("objective", PAIRWISE)
-def test_where_nothing_is_sampled_only_the_demonstrations_count(objective):
+@pytest.mark.parametrize("objective", [objectives.visitation, objectives.transition])
+def test_where_nothing_is_sampled_nothing_is_learned(objective):
     demonstrations = Scored(jnp.ones(2), jnp.zeros(2), jnp.ones(2, bool))
     for background in (
         Scored(jnp.ones(3), jnp.zeros(3), jnp.zeros(3, bool)),
         Scored(jnp.ones(3), jnp.full(3, -jnp.inf), jnp.ones(3, bool)),
     ):
-        (slopes, others), found = differences(objective, demonstrations, background, append=False)
-        np.testing.assert_allclose(slopes, 0.5)
-        assert (others == 0).all()
-        assert (found.value, found.effective_sample_size) == (1.0, 0.0)
+        slopes, found = differences(objective, demonstrations, background, append=False)
+        assert all((slope == 0).all() for slope in slopes)
+        assert (found.value, found.effective_sample_size) == (0.0, 0.0)
 
 
-@given(
-    st.lists(st.floats(-50, 50, width=32) | st.just(float("inf")), min_size=1, max_size=8),
-    st.floats(0, 2),
-    st.floats(0.1, 30),
+def test_infinite_densities_of_either_sign_have_weight_zero_and_nan_is_seen():
+    found = objectives.log_weight(jnp.array([jnp.inf, -jnp.inf, 2.0, -300.0, jnp.nan]))
+    np.testing.assert_array_equal(found, [-np.inf, -np.inf, -2.0, 300.0, np.nan])
+
+
+weigh = jax.jit(objectives.weighed, static_argnames="append")
+some_weights = st.lists(
+    st.floats(-500, 500, width=32) | st.just(float("-inf")), min_size=1, max_size=6
 )
-def test_weights_are_tempered_and_then_clipped_about_their_mean(densities, exponent, limit):
-    density = np.array(densities, np.float32)
-    mask = np.arange(len(density)) % 3 != 2
-    found = objectives.log_weights(
-        jnp.asarray(density), jnp.asarray(mask), exponent=exponent, limit=limit
-    )
-    counted = mask & np.isfinite(density)
-    tempered = -exponent * density[counted].astype(np.float64)
-    if counted.any():
-        centre = tempered.mean()
-        expected = np.clip(tempered, centre - limit, centre + limit)
-        np.testing.assert_allclose(found[counted], expected, rtol=1e-4, atol=1e-3)
-    assert np.isneginf(found[np.isposinf(density)]).all()
+
+
+@given(some_weights, some_weights, st.booleans(), st.floats(0, 2), st.floats(0.1, 30))
+def test_weights_are_tempered_and_clipped_about_the_mean_of_all_samples(
+    first, second, append, exponent, limit
+):
+    padded = [np.float32([*found, *[0.0] * (6 - len(found))]) for found in (first, second)]
+    masks = [np.arange(6) < len(found) for found in (first, second)]
+    batches = [
+        Scored(jnp.zeros(6), jnp.asarray(log_weight), jnp.asarray(mask))
+        for log_weight, mask in zip(padded, masks, strict=True)
+    ]
+    found = weigh(*batches, append=append, exponent=exponent, limit=limit)
+    used = [
+        exponent * log_weight[mask & np.isfinite(log_weight)].astype(np.float64)
+        for log_weight, mask in zip(padded, masks, strict=True)
+    ]
+    samples = np.concatenate(used if append else used[1:])
+    centre = samples.mean() if samples.size else 0.0
+    for scored, log_weight, mask, own in zip(found, padded, masks, used, strict=True):
+        kept = mask & np.isfinite(log_weight)
+        expected = np.clip(own, centre - limit, centre + limit)
+        np.testing.assert_allclose(scored.log_weight[kept], expected, rtol=1e-4, atol=1e-3)
+        assert np.isneginf(scored.log_weight[np.isneginf(log_weight)]).all()
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -129,7 +141,7 @@ def test_the_transition_objective_is_stationary_at_its_closed_form_optimum(weigh
         cell = np.repeat(np.arange(6), counts.ravel())
         everywhere = jnp.ones(len(cell), bool)
         density = jnp.asarray(log_density.ravel()[cell])
-        return Scored(reward.ravel()[cell], objectives.log_weights(density, everywhere), everywhere)
+        return Scored(reward.ravel()[cell], objectives.log_weight(density), everywhere)
 
     def value(reward):
         return objectives.transition(

@@ -15,7 +15,10 @@ from cmedirl_jax.schedules import RewardSchedule, Schedule
 from tests import pools
 
 LIMIT = 40
-ENV = pools.ENV._replace(default_params=pools.ENV.default_params.replace(max_episode_steps=LIMIT))
+ENV = pools.ENV._replace(
+    spec=pools.ENV.spec._replace(max_episode_steps=LIMIT),
+    default_params=pools.ENV.default_params.replace(max_episode_steps=LIMIT),
+)
 SMALL = Settings(
     architecture=Architecture(hidden=(8, 8)),
     schedule=Schedule(batch_size=8, learning_starts=10),
@@ -252,10 +255,12 @@ def test_a_terminated_transition_earns_what_the_absorbing_state_goes_on_to():
 )
 def test_the_objectives_learn_with_their_weights(objective, weights):
     settings = with_(
+        exploration={"kind": "gaussian" if objective == "trajectory" else "ornstein-uhlenbeck"},
         reward={"objective": objective, "weight_limit": 3.0, "gradient_penalty": 0.1},
         reward_schedule={
             "weights": weights,
-            "snapshots": 2,
+            "recent": 50,
+            "snapshots": 5,
             "snapshot_period": 10,
             "trajectories": 2,
             "episodes": 2,
@@ -264,13 +269,15 @@ def test_the_objectives_learn_with_their_weights(objective, weights):
         },
     )
     _, before, advance = start("me-ddpg", settings)
-    after, log = advance(before, 0, 41)
-    assert log.reward_learned.sum() == 2
-    of_updates = jax.tree.map(lambda leaf: np.asarray(leaf)[[20, 40]], log.reward)
+    after, log = advance(before, 0, 61)
+    assert log.reward_learned.sum() == 3
+    of_updates = jax.tree.map(lambda leaf: np.asarray(leaf)[[20, 40, 60]], log.reward)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((of_updates, after.reward)))
     most = 4 if objective == "trajectory" else 16
     size = of_updates.effective_sample_size
     assert ((size > 0.99) & (size <= most + 1e-3)).all()
+    # Before the first episode has ended at step 40 the demonstrations are among themselves.
+    assert (size[0] <= 2.001) == (objective == "trajectory")
     networks = (before.reward.params.network, after.reward.params.network)
     pairs = zip(*map(jax.tree.leaves, networks), strict=True)
     assert all((a != b).any() for a, b in pairs)
@@ -281,7 +288,8 @@ def test_rewards_that_do_not_learn_stay_and_a_discriminator_does_not(method):
     _, before, advance = start(method)
     after, log = advance(before, 0, 30)
     pairs = zip(*map(jax.tree.leaves, (before.reward.params, after.reward.params)), strict=True)
-    assert [(a == b).all() for a, b in pairs][-1] == (method != "gail")
+    same = [bool((a == b).all()) for a, b in pairs]
+    assert not any(same) if method == "gail" else all(same)
     assert (log.reward is None) == (method != "gail")
 
 

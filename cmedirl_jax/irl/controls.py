@@ -42,13 +42,13 @@ def constant(value: float) -> RewardLearner:
 def random(
     spec: EnvSpec, hparams: IRLHParams | None = None, *, network: Network | None = None
 ) -> RewardLearner:
-    """r_D = bounded f, f a random network with mean 0 and deviation 1 over uniform pairs.
+    """r_D = bound tanh(f), f a random network with mean 0 and deviation 1 over uniform pairs.
 
     So it is of the scale of a learned reward with the same bound, and says nothing.
 
     Args:
         spec: whose bounds must be finite.
-        hparams: of which the bound and its kind are read.
+        hparams: of which the bound is read.
         network: default `rewards.mlp(spec)`; its parameters are drawn such that it varies.
 
     Raises:
@@ -74,7 +74,7 @@ def random(
     def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
         params, mean, deviation = state.params
         output = (network.apply(params, observation, action) - mean) / deviation
-        return regularisers.bounded(output, state.hparams.bound, state.hparams.bounded_by)
+        return regularisers.bounded(output, state.hparams.bound)
 
     return RewardLearner(init, reward, base.learn_nothing)
 

@@ -30,7 +30,8 @@ class IRLHParams(flax.struct.PyTreeNode):
     bound: float = 0.1
     """Largest magnitude of r_D, before any gauge."""
     output_penalty: float = 0.05
-    """Weight of the mean squared f(s, a) against the log-likelihood; keeps tanh off its ends."""
+    """Weight of the mean squared f(s, a) against the log-likelihood, and of the absorbing state's
+    f^2; keeps tanh off its ends."""
     prior_precision: float = 0.0
     """Precision lambda of the Gaussian prior, log P(theta) = -lambda/2 ||theta||^2 (Eq. 4)."""
     gradient_penalty: float | None = None
@@ -45,7 +46,7 @@ class IRLHParams(flax.struct.PyTreeNode):
     weight_exponent: float = 1.0
     """Exponent of importance weights: 1 as they are, 0 uniform."""
     weight_limit: float | None = None
-    """Largest distance of an importance weight's logarithm from the batch's mean; None: any."""
+    """Largest distance of an importance weight's logarithm from the samples' mean; None: any."""
     objective: Objective = flax.struct.field(pytree_node=False, default="visitation")
     """How E[mu] is estimated, see `irl.objectives`; the last takes trajectories."""
     bounded_by: BoundKind = flax.struct.field(pytree_node=False, default="tanh")
@@ -53,7 +54,8 @@ class IRLHParams(flax.struct.PyTreeNode):
     gauge: Gauge = flax.struct.field(pytree_node=False, default="none")
     """Constant taken off r_D: none, its background mean, or the demonstrations' largest."""
     absorbing: bool = flax.struct.field(pytree_node=False, default=False)
-    """Learn the reward of an absorbing state after termination (Kostrikov et al. 2019)."""
+    """Learn the reward of an absorbing state after termination (Kostrikov et al. 2019). Of pairs,
+    one more sample follows each termination; of trajectories, the rest of the time limit."""
     append_demonstrations: bool = flax.struct.field(pytree_node=False, default=True)
     """Append the demonstration batch to the background batch (Algorithm 1, line 4)."""
 
@@ -95,13 +97,8 @@ def make(
         network: f(s, a), default `rewards.mlp(spec)`.
         optimizer: default Adam at `state.hparams.learning_rate`; it is handed the gradient of the
             *negative* posterior, to descend.
-
-    Raises:
-        ValueError: for an infinite bound; `bounded_by` none is what leaves r_D unbounded.
     """
     hparams = hparams or IRLHParams()
-    if isinstance(hparams.bound, float) and np.isinf(hparams.bound):
-        raise ValueError('the bound must be finite; for an unbounded reward take bounded_by "none"')
     network = network or rewards.mlp(spec)
     tx = optax.with_extra_args_support(optimizer or optimizers.adam())
     checked = base.trajectories if hparams.objective == "trajectory" else base.pairs
@@ -158,11 +155,12 @@ def make(
             params, absorbed = learned
             output = network.apply(params, every.observation, every.action)
             found = jnp.split(bounded(output, state.hparams), steps[0].mask.shape)
+            penalty = regularisers.output_penalty(output, every.mask)
             if absorbed is not None:
+                penalty += jnp.square(absorbed)
                 absorbed = bounded(absorbed, state.hparams)
             likelihood = log_likelihood(state.hparams, batches, found, absorbed)
             log_prior = regularisers.log_prior(learned, state.hparams.prior_precision)
-            penalty = regularisers.output_penalty(output, every.mask)
             loss = state.hparams.output_penalty * penalty - (likelihood.value + log_prior)
             if state.hparams.gradient_penalty is not None:
                 loss += state.hparams.gradient_penalty * slope(params, steps, state.hparams, key)
@@ -209,17 +207,21 @@ def log_likelihood(
         absorbed: `[]`, r_D of the absorbing state, or None without one.
     """
     score = _score_trajectories if hparams.objective == "trajectory" else _score_pairs
-    demonstrations, background = (
-        score(hparams, batch, r_d, absorbed) for batch, r_d in zip(batches, found, strict=True)
+    append = hparams.append_demonstrations
+    demonstrations, background = objectives.weighed(
+        *(score(hparams, batch, r_d, absorbed) for batch, r_d in zip(batches, found, strict=True)),
+        append=append,
+        exponent=hparams.weight_exponent,
+        limit=hparams.weight_limit,
     )
-    objective = getattr(objectives, hparams.objective)
-    return objective(demonstrations, background, append=hparams.append_demonstrations)
+    return getattr(objectives, hparams.objective)(demonstrations, background, append=append)
 
 
 def _score_pairs(
     hparams: IRLHParams, batch: RewardBatch, r_d: jax.Array, absorbed: jax.Array | None
 ) -> Scored:
-    scored = Scored(r_d, _log_weights(hparams, batch.log_density, batch.mask), batch.mask)
+    del hparams
+    scored = Scored(r_d, objectives.log_weight(batch.log_density), batch.mask)
     if absorbed is None:
         return scored
     # After each termination one more sample, of the absorbing state.
@@ -238,13 +240,7 @@ def _score_trajectories(
         r_d = jnp.where(mask, r_d, absorbed)
         mask |= jnp.any(mask & batch.transition.terminated, axis=-1, keepdims=True)
     total = objectives.returns(r_d, mask, hparams.discount)
-    return Scored(total, _log_weights(hparams, batch.log_density, some), some)
-
-
-def _log_weights(hparams: IRLHParams, log_density: jax.Array, mask: jax.Array) -> jax.Array:
-    return objectives.log_weights(
-        log_density, mask, exponent=hparams.weight_exponent, limit=hparams.weight_limit
-    )
+    return Scored(total, objectives.log_weight(batch.log_density), some)
 
 
 def _steps(batch: RewardBatch) -> _Steps:

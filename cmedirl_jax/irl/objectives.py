@@ -1,7 +1,8 @@
 """The data term of the log-likelihood, L_D, estimated from samples.
 
-The derivative of each by the rewards is mu_D - E[mu] (Eqs. 6 and 8): the demonstrations' empirical
-visitation minus that of weighted samples. They differ in the weights `w`, which sum to one:
+The derivative of each by the rewards is mu_D - E[mu] (Eqs. 6 and 8), both undiscounted and of sum
+one: the frequency of the batch of demonstrations minus that of weighted samples. They differ in the
+weights `w`:
 
 - `visitation`: w ~ z. The plain difference of two means; linear in the reward, so nothing in it
   holds the reward back.
@@ -10,7 +11,7 @@ visitation minus that of weighted samples. They differ in the weights `w`, which
 
 `z` is the derivative of the base measure (see `irl.densities`) by the law that the samples came
 from: uniform, or 1 / density. Appending the demonstrations to the samples (Algorithm 1, line 4)
-keeps the two exponential objectives bounded; the linear one it only rescales.
+keeps the two exponential objectives bounded; the linear one, of uniform weights, it only rescales.
 """
 
 from typing import Literal, NamedTuple
@@ -18,6 +19,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax.irl.regularisers import masked_mean
 from cmedirl_jax.types import Numeric
 
 Objective = Literal["visitation", "transition", "trajectory"]
@@ -58,9 +60,10 @@ def visitation(demonstrations: Scored, background: Scored, *, append: bool) -> L
         append: whether the demonstrations join the samples (Algorithm 1, line 4).
     """
     samples = _samples(demonstrations, background, append)
-    weight = _normalised(samples.log_weight, samples.mask)
+    counts = _counts(samples)
+    weight = _normalised(samples.log_weight, counts)
     value = _mean(demonstrations) - jnp.sum(weight * samples.reward)
-    return Likelihood(value, _effective_sample_size(weight))
+    return _likelihood(value, weight, jnp.any(counts))
 
 
 def transition(demonstrations: Scored, background: Scored, *, append: bool) -> Likelihood:
@@ -98,44 +101,69 @@ def returns(reward: jax.Array, mask: jax.Array, discount: Numeric = 1.0) -> jax.
     return jnp.sum(jnp.where(mask, discount**steps * reward, 0.0), axis=-1)
 
 
-def log_weights(
-    log_density: jax.Array,
-    mask: jax.Array,
+def weighed(
+    demonstrations: Scored,
+    background: Scored,
     *,
+    append: bool,
     exponent: Numeric = 1.0,
     limit: Numeric | None = None,
-) -> jax.Array:
-    """log z of samples of a given log density, tempered and clipped: `[B]` -> `[B]`.
+) -> tuple[Scored, Scored]:
+    """Temper and clip the weights of both batches, about the mean of the samples' logarithms.
 
-    Tempering and clipping trade the weights' bias for their variance; over the hundreds of steps of
-    a trajectory the weights collapse onto one sample without them.
+    That trades the weights' variance for a bias; over the hundreds of steps of a trajectory they
+    collapse onto one sample without it.
 
     Args:
-        log_density: with respect to the base measure; +inf gives weight 0.
-        mask: which samples count.
+        demonstrations: scored.
+        background: scored.
+        append: whether the demonstrations are among the samples.
         exponent: z^exponent in place of z; 0 gives uniform weights.
         limit: largest distance of log z^exponent from its mean; None for any.
     """
-    counts = mask & jnp.isfinite(log_density)
-    log_z = -exponent * jnp.where(counts, log_density, 0.0)
-    if limit is not None:
-        centre = jnp.sum(jnp.where(counts, log_z, 0.0)) / jnp.maximum(jnp.sum(counts), 1)
-        log_z = jnp.clip(log_z, centre - limit, centre + limit)
-    return jnp.where(jnp.isposinf(log_density), -jnp.inf, log_z)
+    samples = _samples(demonstrations, background, append)
+    counts = _counts(samples)
+    centre = masked_mean(jnp.where(counts, exponent * samples.log_weight, 0.0), counts)
+
+    def weigh(scored: Scored) -> Scored:
+        # Of weight zero stays so, whatever the exponent.
+        some = scored.log_weight != -jnp.inf
+        log_weight = exponent * jnp.where(some, scored.log_weight, 0.0)
+        if limit is not None:
+            log_weight = jnp.clip(log_weight, centre - limit, centre + limit)
+        return scored._replace(log_weight=jnp.where(some, log_weight, -jnp.inf))
+
+    return weigh(demonstrations), weigh(background)
+
+
+def log_weight(log_density: jax.Array) -> jax.Array:
+    """log z of samples of a given log density with respect to the base measure: `[B]` -> `[B]`.
+
+    An infinite density, at an atom that the base measure lacks, gives weight 0; so does a density
+    of zero, which says that the sample is not of this law at all.
+    """
+    return jnp.where(jnp.isinf(log_density), -jnp.inf, -log_density)
 
 
 def _log_partition_likelihood(
     demonstrations: Scored, background: Scored, append: bool
 ) -> Likelihood:
     samples = _samples(demonstrations, background, append)
-    exponent = samples.reward + samples.log_weight
-    counts = samples.mask & (samples.log_weight > -jnp.inf)
-    # Where nothing counts the partition function is taken for one: there is no gradient to give.
+    exponent, counts = samples.reward + samples.log_weight, _counts(samples)
     some = jnp.any(counts)
     log_sum = jax.nn.logsumexp(jnp.where(some, exponent, 0.0), where=counts | ~some)
     log_mean = log_sum - jnp.log(jnp.maximum(jnp.sum(samples.mask), 1))
-    value = _mean(demonstrations) - jnp.where(some, log_mean, 0.0)
-    return Likelihood(value, _effective_sample_size(_normalised(exponent, samples.mask)))
+    weight = _normalised(exponent, counts)
+    return _likelihood(_mean(demonstrations) - log_mean, weight, some)
+
+
+def _likelihood(value: jax.Array, weight: jax.Array, some: jax.Array) -> Likelihood:
+    """With no sample to hold the demonstrations against, there is nothing to learn."""
+    total = jnp.sum(jnp.square(jax.lax.stop_gradient(weight)))
+    return Likelihood(
+        value=jnp.where(some, value, 0.0),
+        effective_sample_size=jnp.where(some, 1.0 / jnp.where(some, total, 1.0), 0.0),
+    )
 
 
 def _samples(demonstrations: Scored, background: Scored, append: bool) -> Scored:
@@ -144,20 +172,16 @@ def _samples(demonstrations: Scored, background: Scored, append: bool) -> Scored
     return Scored(*map(jnp.concatenate, zip(demonstrations, background, strict=True)))
 
 
+def _counts(scored: Scored) -> jax.Array:
+    return scored.mask & (scored.log_weight != -jnp.inf)
+
+
 def _mean(scored: Scored) -> jax.Array:
-    total = jnp.sum(jnp.where(scored.mask, scored.reward, 0.0))
-    return total / jnp.maximum(jnp.sum(scored.mask), 1)
+    return masked_mean(scored.reward, scored.mask)
 
 
-def _normalised(log_weight: jax.Array, mask: jax.Array) -> jax.Array:
-    """Weights that sum to one, or are all zero where there is none."""
-    counts = mask & (log_weight > -jnp.inf)
+def _normalised(log_weight: jax.Array, counts: jax.Array) -> jax.Array:
+    """Weights that sum to one, or are all zero where nothing counts."""
     largest = jax.lax.stop_gradient(jnp.max(log_weight, initial=-jnp.inf, where=counts))
     weight = jnp.where(counts, jnp.exp(jnp.where(counts, log_weight - largest, 0.0)), 0.0)
     return weight / jnp.maximum(jnp.sum(weight), 1.0)
-
-
-def _effective_sample_size(weight: jax.Array) -> jax.Array:
-    weight = jax.lax.stop_gradient(weight)
-    total = jnp.sum(jnp.square(weight))
-    return jnp.where(total > 0, 1.0 / jnp.where(total > 0, total, 1.0), 0.0)

@@ -104,8 +104,8 @@ def gauge_offset(
 
     - "none": 0.
     - "zero-mean": the mean of r_D over the background.
-    - "demonstration-maximum": the largest r_D of the demonstrations, so that no demonstrated pair
-      earns more than nothing.
+    - "demonstration-maximum": the largest r_D of the demonstrations, so that demonstrated pairs
+      earn about nothing at best; the learner follows it batch by batch.
 
     Args:
         kind: which.
