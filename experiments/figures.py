@@ -25,6 +25,12 @@ LABELS = {
     "tabular-me-ddpg": "tabular ME-DDPG",
     "maxent-irl": "MaxEnt IRL",
     "deep-maxent-irl": "deep MaxEnt IRL",
+    "bc": "behaviour cloning",
+    "irl-only": "$r_D$ alone",
+    "gail": "GAIL",
+    "ddpg-plus-constant": "DDPG, $r_e + c$",
+    "ddpg-minus-constant": "DDPG, $r_e - c$",
+    "random-reward": "DDPG, random $r_D$",
 }
 
 
@@ -68,9 +74,9 @@ def average_return(
 ) -> Figure:
     """Figure 3: noise-free return over environment steps; behaviour return over episodes."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharey=True)
-    for colour, method in zip(itertools.cycle(COLOURS), _methods(evaluations), strict=False):
+    for method, line in _lines(evaluations).items():
         rows = evaluations.filter((pl.col("method") == method) & (pl.col("protocol") == "steps"))
-        _band(left, rows, "env_step", "return_mean", method, colour)
+        _band(left, rows, "env_step", "return_mean", method, line)
         rows = episodes.filter(pl.col("method") == method)
         if rows.height:
             # Where the first seed runs out of episodes the seeds left are no longer the same ones.
@@ -83,7 +89,7 @@ def average_return(
                 "episode",
                 "return",
                 method,
-                colour,
+                line,
             )
     for axes in (left, right):
         if expert is not None:
@@ -133,8 +139,8 @@ def return_after_convergence(summary: pl.DataFrame, expert: float | None) -> Fig
 def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None:
     numbers = sorted(set(summary.filter(pl.col("n_demos") > 0)["n_demos"]))
     positions = np.arange(len(numbers))
-    methods = _methods(summary)
-    for index, (colour, method) in enumerate(zip(itertools.cycle(COLOURS), methods, strict=False)):
+    lines = _lines(summary)
+    for index, (method, line) in enumerate(lines.items()):
         rows = summary.filter(pl.col("method") == method).sort("n_demos")
         low, middle, high = (
             rows[column + end].cast(pl.Float64).to_numpy() for end in ("_low", "", "_high")
@@ -143,21 +149,23 @@ def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None
         if np.isnan(middle).all():
             continue
         if rows["n_demos"].max() == 0:
-            axes.axhline(middle[0], color=colour, label=label)
+            axes.axhline(middle[0], **line, label=label)
             if not np.isnan(high[0]):
-                axes.axhspan(low[0], high[0], color=colour, alpha=0.15, linewidth=0)
+                axes.axhspan(low[0], high[0], color=line["color"], alpha=0.15, linewidth=0)
             continue
         at = positions[np.isin(numbers, rows["n_demos"].to_numpy())]
-        offset = 0.06 * (index - (len(methods) - 1) / 2)
+        offset = 0.06 * (index - (len(lines) - 1) / 2)
         # What was never reached is left out; an arrow stands for an interval without upper bound.
         unbounded = np.isnan(high) & ~np.isnan(middle)
         bars = np.array([middle - low, np.where(np.isnan(high), 0.0, high - middle)])
-        axes.plot((at + offset)[unbounded], middle[unbounded], "^", color=colour, markersize=10)
+        axes.plot(
+            (at + offset)[unbounded], middle[unbounded], "^", color=line["color"], markersize=10
+        )
         axes.errorbar(
             at + offset,
             middle,
             bars,
-            color=colour,
+            **line,
             marker="o",
             capsize=3,
             label=label,
@@ -166,7 +174,9 @@ def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None
     axes.set_xlabel("demonstrations $N_T$")
 
 
-def _band(axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, colour: str) -> None:
+def _band(
+    axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, line: dict[str, str]
+) -> None:
     points = rows.group_by(x, maintain_order=True).agg(pl.col(y)).sort(x)
     seeds = rows["seed"].n_unique()
     points = points.filter(pl.col(y).list.len() == seeds)
@@ -176,11 +186,11 @@ def _band(axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, colour: s
     label = LABELS.get(method, method)
     if len(intervals) == 1:
         # Of a method that never interacts: the same at every step.
-        axes.axhline(intervals[0, 0], color=colour, linestyle="-.", label=label)
+        axes.axhline(intervals[0, 0], **line | {"linestyle": "-."}, label=label)
         return
-    axes.plot(points[x], intervals[:, 0], color=colour, label=label)
+    axes.plot(points[x], intervals[:, 0], **line, label=label)
     axes.fill_between(
-        points[x], intervals[:, 1], intervals[:, 2], color=colour, alpha=0.2, linewidth=0
+        points[x], intervals[:, 1], intervals[:, 2], color=line["color"], alpha=0.2, linewidth=0
     )
 
 
@@ -191,5 +201,11 @@ def _legend(figure: Figure, axes: Axes) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
 
 
-def _methods(table: pl.DataFrame) -> list[str]:
-    return table["method"].unique(maintain_order=True).to_list()
+def _lines(table: pl.DataFrame) -> dict[str, dict[str, str]]:
+    """Each method's line: a colour of its own, dashed once the palette is used up."""
+    methods = table["method"].unique(maintain_order=True)
+    styles = itertools.product(("-", "--", ":"), COLOURS)
+    return {
+        method: {"color": colour, "linestyle": style}
+        for method, (style, colour) in zip(methods, styles, strict=False)
+    }

@@ -158,3 +158,10 @@ def test_figure_4_leaves_out_what_never_converged():
         np.testing.assert_array_equal(by_label["DDPG"].get_ydata(), [median] * 2)
         np.testing.assert_array_equal(by_label["ME-DDPG"][0].get_ydata(), [np.nan, median])
         np.testing.assert_array_equal(by_label["HS-DDPG"][0].get_ydata(), [0.0, 0.0])
+
+
+def test_more_methods_than_colours_have_lines_of_their_own():
+    methods = [f"method {index}" for index in range(2 * len(figures.COLOURS) + 1)]
+    lines = figures._lines(pl.DataFrame({"method": methods}))
+    assert list(lines) == methods
+    assert len({tuple(line.values()) for line in lines.values()}) == len(methods)
