@@ -206,3 +206,11 @@ def test_actions_without_noise_at_one_state_give_the_smallest_scale(observation)
     np.testing.assert_allclose(found.coefficients, [MEAN, [0, 0], [0, 0]], atol=1e-6)
     np.testing.assert_allclose(found.scale, densities.SCALE_FLOOR * np.array([2.0, 0.25]))
     assert jnp.isfinite(densities.gaussian_policy(SPEC, found, observation[0], ACTIONS)).all()
+
+
+def test_the_fit_calls_no_lapack():
+    """Several CPU devices that are ahead of the host can wait in it for Python's lock for ever."""
+    text = fit_gaussian.lower(np.ones((4, 2), np.float32), np.ones((4, 1), np.float32), None)
+    assert "lapack" not in text.as_text().lower()
+    solved = jax.jit(jnp.linalg.lstsq).lower(np.ones((4, 2), np.float32), np.ones((4, 1)))
+    assert "lapack" in solved.as_text().lower()

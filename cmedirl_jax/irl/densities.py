@@ -139,8 +139,15 @@ def fit_gaussian(
     # Of what does not vary there is only the mean's rounding, which is not to be scaled up.
     spread = jnp.where(spread > 1e-6 * jnp.abs(mean), spread, jnp.inf)
     standard = (observation - mean) / spread
-    root = jnp.sqrt(weight)[:, None]
-    slopes = jnp.linalg.lstsq(root * standard, root * (action - action_mean))[0]
+    share = (weight / jnp.sum(weight))[:, None]
+    # Conjugate gradients end after O steps, and stay at zero where nothing varies. A factorisation
+    # by LAPACK, dispatched ahead to several CPU devices, can wait for Python's lock for ever.
+    slopes, _ = jax.scipy.sparse.linalg.cg(
+        lambda slopes: standard.T @ (share * (standard @ slopes)),
+        standard.T @ (share * (action - action_mean)),
+        tol=1e-6,
+        maxiter=4 * standard.shape[1],
+    )
     residual = action - action_mean - standard @ slopes
     slopes = slopes / spread[:, None]
     floor = 0.5 * SCALE_FLOOR * (spec.action_high - spec.action_low)
