@@ -6,10 +6,15 @@ import pytest
 
 from cmedirl_jax import envs
 from cmedirl_jax.types import EnvSpec
+from tests import compiling
 
 # The first example of a test compiles, so deadlines would only measure the compiler.
 hypothesis.settings.register_profile("reproducible", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("reproducible")
+
+
+def pytest_configure():
+    compiling.be_quick()
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -23,7 +28,7 @@ def no_users_cache(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def quick_compilation(request):
-    """Most tests compile for longer than they run; the marked ones run as a user's program does."""
+    """Most tests compile for longer than they run; the marked ones are optimised."""
     optimised = [request.node.get_closest_marker(name) for name in ("statistical", "optimised")]
     jax.config.update("jax_disable_most_optimizations", not any(optimised))
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import measuring, naive, ours, peers, seeds_per_second
+from benchmarks import measuring, naive, ours, peers, plots, seeds_per_second
 from benchmarks.measuring import Record
 from benchmarks.peers import PEERS
 from benchmarks.serving import Worker
@@ -150,13 +150,19 @@ def fake_start(monkeypatch):
 
 
 @pytest.mark.parametrize("quick", [True, False])
-def test_seeds_per_second_writes_what_the_design_lists(fake_start, tmp_path, quick, capsys):
+def test_seeds_per_second_writes_what_the_design_lists(
+    fake_start, monkeypatch, tmp_path, quick, capsys
+):
     path = tmp_path / "new" / "speed.json"
+    # It draws after each suite; here the last figure alone, of all that was measured.
+    drawn, draw = [], plots.growth
+    monkeypatch.setattr(plots, "growth", lambda *args: drawn.append(args))
     options = seeds_per_second.Options(quick=quick, json=path)
     assert seeds_per_second.main(options) == 0
     written = json.loads(path.read_text())
     assert {"machine", "versions", "records", "command", "date"} <= written.keys()
     assert all(record.keys() >= DESIGNED for record in written["records"])
+    draw(*drawn[-1])
     assert path.with_suffix(".png").stat().st_size
     name = "ours / naive" if quick else "ours / naive, ddpg, 100 seeds"
     (ratio,) = (entry for entry in written["comparisons"] if entry["name"] == name)

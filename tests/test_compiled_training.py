@@ -11,6 +11,7 @@ import pytest
 from cmedirl_jax import hot_start, seeds, training
 from cmedirl_jax.methods import METHODS, Settings
 from tests import pools
+from tests.compiling import jit_as_users
 
 SEEDS, GROUP, CAPACITY = 4, 2, 10_000
 
@@ -24,7 +25,7 @@ def compiled(request, env):
     init = jax.vmap(trainer.init, in_axes=(0, None, None))
     shape = jax.eval_shape(init, seeds.keys(jax.random.key(0), SEEDS), data, 2)
     states = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
-    run = jax.jit(seeds.step_groups(trainer.run, GROUP), donate_argnums=0)
+    run = jit_as_users(seeds.step_groups(trainer.run, GROUP), donate_argnums=0)
     arguments = (2, data, jnp.arange(200, 203), jnp.int32(10))
     # A donated buffer that cannot be used would be a warning.
     with warnings.catch_warnings():

@@ -6,6 +6,7 @@ import pytest
 from cmedirl_jax import evaluation, tabular
 from cmedirl_jax.tabular import discretise
 from cmedirl_jax.tabular.interpolation import points
+from tests.compiling import jit_as_users
 
 SHAPE, ACTIONS = (31, 21), (5,)
 
@@ -95,7 +96,7 @@ def test_a_hundred_by_a_hundred_cells_with_eleven_actions_fit(env):
 def test_the_discretised_optimum_solves_the_continuous_task(env):
     """With what it earns there close to what the table says it is worth."""
 
-    @jax.jit
+    @jit_as_users
     def solve():
         mdp = discretise.make(env, (100, 100), (11,))
         best = tabular.value_iteration(

@@ -11,6 +11,7 @@ from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.imitation import TabularSettings
 from cmedirl_jax.tabular.interpolation import points
 from tests import pools
+from tests.compiling import jit_as_users
 
 SMALL = TabularSettings(states=11, actions=3, steps=3, centres=3, hidden=(8,))
 
@@ -84,7 +85,7 @@ def test_the_reward_of_twelve_demonstrations_solves_the_task(kind):
     env, params = pools.ENV, pools.ENV.default_params
     data = hot_start.data(pools.scripted(push=0.6))
 
-    @jax.jit
+    @jit_as_users
     def returns(data):
         mdp = imitation.discretised(env, settings)
         found = imitation.fit(jax.random.key(0), mdp, env.spec, data, kind=kind, settings=settings)

@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 
 from cmedirl_jax import envs
 from cmedirl_jax.envs.mountain_car import MountainCarState
+from tests.compiling import jit_as_users
 
 ENV = envs.make("MountainCarContinuous-v0")
 PARAMS = ENV.default_params
 KEY = jax.random.key(0)
 
-step = jax.jit(ENV.step)
-step_many = jax.jit(jax.vmap(ENV.step, in_axes=(None, 0, 0, None)))
+step = jit_as_users(ENV.step)
+step_many = jit_as_users(jax.vmap(ENV.step, in_axes=(None, 0, 0, None)))
 
 pytestmark = pytest.mark.optimised
 
@@ -117,7 +118,7 @@ def gymnasium_episode(car, start, actions):
     return len(rewards), terminated, sum(rewards), hit
 
 
-@jax.jit
+@jit_as_users
 @jax.vmap
 def episode(start, actions):
     def advance(car_state, action):

@@ -15,7 +15,7 @@ from cmedirl_jax import checkpoint, demonstrations
 from cmedirl_jax.methods import METHODS
 from experiments import experts, grid, results, run_grid
 from experiments.errors import UserError
-from tests import pools
+from tests import compiling, pools
 
 ROOT = Path(__file__).parents[1]
 SMOKE = ("--preset", "smoke")
@@ -125,7 +125,7 @@ def test_what_cannot_work_is_refused_in_a_line(refused, arguments, line):
         "--reward-schedule.period",
         "--hot-start.cells",
         "--architecture.hidden",
-        "--reward-schedule.hidden",
+        "--reward-network.hidden",
     ],
 )
 def test_sizes_must_be_positive(refused, option, size):
@@ -239,6 +239,7 @@ def compiled(tmp_path_factory):
     return {
         "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {compiling.QUICK_COMMANDS}",
     }
 
 
@@ -287,7 +288,13 @@ def test_a_run_evaluates_every_seed_of_every_cell_from_step_0_on(smoke):
     assert table.select("method", "n_demos", "seed", "env_step").rows() == [
         (*cell, seed, step) for cell in CELLS for seed in range(SEEDS) for step in STEPS
     ]
-    assert table.drop("q_mean", "critic_loss").null_count().sum_horizontal().item() == 0
+    losses = ("q_mean", "critic_loss")
+    of_rewards = ("demonstration_reward", "background_reward", "effective_sample_size")
+    assert table.drop(*losses, *of_rewards).null_count().sum_horizontal().item() == 0
+    learned = table.filter(
+        pl.col("method").str.ends_with("me-ddpg"), pl.col("env_step") == STEPS[-1]
+    )
+    assert learned.select(of_rewards).null_count().sum_horizontal().item() == 0
 
 
 def test_episodes_have_the_designed_columns_and_follow_each_other(smoke):

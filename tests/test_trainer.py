@@ -106,17 +106,18 @@ def test_how_steps_are_cut_into_chunks_does_not_matter(method):
 
 
 def test_a_seed_does_not_depend_on_its_neighbours_or_their_grouping():
-    trainer, _, _ = compiled("hs-me-ddpg")
+    trainer, init, run = compiled("hs-me-ddpg")
 
     def train(key, data):
-        return trainer.run(trainer.init(key, data, 3), data, jnp.arange(50))
+        return trainer.run(trainer.init(key, data, 3), data, jnp.arange(40))
 
     def all_of(count, group):
         keys = seeds.keys(jax.random.key(3), count)
         return jax.jit(seeds.map_groups(train, group))(keys, data())
 
     ten, hundred = all_of(10, 5), all_of(100, 10)
-    alone = jax.jit(train)(jax.random.fold_in(jax.random.key(3), 7), data())
+    state = init(jax.random.fold_in(jax.random.key(3), 7), data(), 3)
+    alone = run(state, data(), jnp.arange(40), None)
     numbers = lambda result: (result[0].agent, result[0].storage, result[1])  # noqa: E731
     seventh = [jax.tree.map(lambda leaf: leaf[7], numbers(r)) for r in (ten, hundred)]
     chex.assert_trees_all_close(*seventh, rtol=1e-3, atol=1e-5)
@@ -217,8 +218,9 @@ def test_r_star_is_stored_as_the_shaping_says(shaping, inputs):
     )
     trainer, state, advance = start("me-ddpg", settings)
     _, plain, plain_advance = start("ddpg")
-    found = stored(advance(state, 0, 8)[0], 8)
-    r_e = stored(plain_advance(plain, 0, 8)[0], 8).reward
+    # Nothing is learned in the first ten steps: both act alike.
+    found = stored(advance(state, 0, 40)[0], 10)
+    r_e = stored(plain_advance(plain, 0, 40)[0], 10).reward
     learner = trainer.algorithm.learner
     pairs = found.observation, found.action
     r_d = learner.reward(state.reward, *pairs)
