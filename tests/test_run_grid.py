@@ -432,3 +432,32 @@ def test_methods_with_a_model_run_beside_the_others(compiled, demos, tmp_path):
     assert {"figure3.png", "figure4.png", "figure5.png"} <= {
         path.name for path in (folder / "figures").iterdir()
     }
+
+
+def test_comparators_and_controls_run_beside_the_others(compiled, demos, tmp_path):
+    methods = ("bc", "gail", "ddpg-minus-constant", "random-reward")
+    folder = tmp_path / "run"
+    done = run_command(
+        *(*SMOKE, "--methods", *methods, "--n-demos", 2, "--demos", demos),
+        *("--seeds", 2, "--max-steps", 250, "--out", folder),
+        *("--hot-start.steps", 5, "--gail.form", "logit D"),
+        **compiled,
+    )
+    assert done.returncode == 0, done.stderr
+    summary = pl.read_csv(folder / "summary.csv")
+    assert summary["method"].to_list() == list(methods)
+    assert summary["n_demos"].to_list() == [2, 2, 0, 0]
+    assert summary["env_steps_learner"].to_list() == [0, 500, 500, 500]
+    assert summary["converged_fraction"].null_count() == 1
+    assert summary["diverged"].sum() == 0
+    evaluations = pl.read_parquet(folder / "evaluations.parquet")
+    assert evaluations.filter(pl.col("method") == "bc")["env_step"].to_list() == [0, 0]
+    learned = evaluations.filter(pl.col("demonstration_reward").is_not_null())
+    assert set(learned["method"]) == {"gail"}
+    constant = checkpoint.load(folder / "rewards" / "ddpg-minus-constant")
+    np.testing.assert_allclose(constant, [-0.1, -0.1])
+    assert {path.name for path in (folder / "rewards").iterdir()} == {
+        "gail-n2",
+        "ddpg-minus-constant",
+        "random-reward",
+    }
