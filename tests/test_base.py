@@ -1,5 +1,3 @@
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -75,9 +73,3 @@ def test_pairs_are_no_trajectories(skewed_spec):
         base.trajectories(skewed_spec, transition(4), "demonstrations")
     with pytest.raises(ValueError, match=r"demonstrations: expected observations \[B, 3\]"):
         base.pairs(skewed_spec, Transition(*np.zeros(5)), "demonstrations")
-
-
-def test_hyperparameters_have_one_type_whoever_made_them():
-    made = [base.traced({"rate": value, "none": None}) for value in (1, 1.0, np.float64(1.0))]
-    assert len({str(jax.tree.map(jnp.asarray, tree)) for tree in made}) == 1
-    assert made[0]["rate"].dtype == jnp.float32

@@ -132,7 +132,7 @@ def make_pool(env, monkeypatch):
         def train(*args, seeds_count, **kwargs):
             zeros = np.zeros(len(seeds))
             found = Evaluation(np.array(returns), zeros, zeros, zeros)
-            first = EvaluationRows("steps", np.arange(2), *[None] * 5)
+            first = EvaluationRows("steps", np.arange(2), *[None] * 4)
             last = EvaluationRows("steps", np.array(seeds), zeros, zeros, found, zeros, zeros)
             return CellResult(
                 evaluations=[first, last],
