@@ -133,7 +133,7 @@ def make_pool(env, monkeypatch):
             zeros = np.zeros(len(seeds))
             found = Evaluation(np.array(returns), zeros, zeros, zeros)
             first = EvaluationRows("steps", np.arange(2), *[None] * 4)
-            last = EvaluationRows("steps", np.array(seeds), zeros, zeros, found, zeros, zeros)
+            last = EvaluationRows("steps", np.array(seeds), zeros, zeros, found, None)
             return CellResult(
                 evaluations=[first, last],
                 episodes=None,
