@@ -332,8 +332,9 @@ def test_only_a_frozen_actor_compiles_a_branch():
     def branches(method, frozen_actor_steps):
         settings = with_(schedule={"frozen_actor_steps": frozen_actor_steps})
         trainer = training.make(ENV, METHODS[method], settings, capacity=400)
-        state = jax.eval_shape(lambda key: trainer.init(key, data(), 3), jax.random.key(0))
-        return str(jax.make_jaxpr(trainer.run)(state, data(), jnp.arange(5))).count("cond[")
+        pool = data()
+        state = jax.eval_shape(lambda key: trainer.init(key, pool, 3), jax.random.key(0))
+        return str(jax.make_jaxpr(trainer.run)(state, pool, jnp.arange(5))).count("cond[")
 
     assert branches("ddpg", 25) == branches("ddpg", 0)
     assert branches("hs-ddpg", 25) == branches("hs-ddpg", 0) + 1
@@ -393,12 +394,24 @@ def test_a_second_chunk_does_not_recompile_and_calls_no_host():
     assert "callback" not in program
 
 
-def test_branches_stay_branches_under_vmap():
+@pytest.mark.parametrize(
+    ("method", "objective", "weights"),
+    [
+        ("hs-me-ddpg", "visitation", "uniform"),
+        ("me-ddpg", "transition", "fusion"),
+        ("me-ddpg", "trajectory", "recorded"),
+        ("gail", "visitation", "uniform"),
+    ],
+)
+def test_branches_stay_branches_under_vmap(method, objective, weights):
     """A predicate that got batched would turn every `cond` into both of its branches."""
-    trainer, state, _ = start("hs-me-ddpg")
-    states = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
+    settings = with_(reward={"objective": objective}, reward_schedule={"weights": weights})
+    trainer = training.make(ENV, METHODS[method], settings, capacity=400)
+    pool = data()
+    init = jax.vmap(lambda key: trainer.init(key, pool, 3))
+    states = jax.eval_shape(init, seeds.keys(jax.random.key(0), 2))
     run = jax.vmap(trainer.run, in_axes=(0, None, None))
-    jaxpr = jax.make_jaxpr(run)(states, data(), jnp.arange(5))
+    jaxpr = jax.make_jaxpr(run)(states, pool, jnp.arange(5))
     (scan,) = [equation for equation in jaxpr.eqns if equation.primitive.name == "scan"]
     conditionals = [e for e in scan.params["jaxpr"].eqns if e.primitive.name == "cond"]
     # Learning the reward, learning at all.
