@@ -5,6 +5,7 @@ state = learner.init(jax.random.key(0))
 state, info = jax.jit(learner.update)(state, demonstrations, background)
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -19,7 +20,7 @@ from cmedirl_jax.irl import base, objectives, regularisers
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.irl.objectives import Likelihood, Objective, Scored
 from cmedirl_jax.irl.regularisers import BoundKind, Gauge
-from cmedirl_jax.types import EnvSpec, Network, Params, RewardBatch, Transition
+from cmedirl_jax.types import EnvSpec, Network, Numeric, Params, RewardBatch, Transition
 
 
 class IRLHParams(flax.struct.PyTreeNode):
@@ -206,10 +207,12 @@ def log_likelihood(
         found: r_D of each batch's pairs, `[B]`, or `[M * T]` for trajectories.
         absorbed: `[]`, r_D of the absorbing state, or None without one.
     """
-    score = _score_trajectories if hparams.objective == "trajectory" else _score_pairs
+    score = _score_pairs
+    if hparams.objective == "trajectory":
+        score = functools.partial(_score_trajectories, discount=hparams.discount)
     append = hparams.append_demonstrations
     demonstrations, background = objectives.weighed(
-        *(score(hparams, batch, r_d, absorbed) for batch, r_d in zip(batches, found, strict=True)),
+        *(score(batch, r_d, absorbed) for batch, r_d in zip(batches, found, strict=True)),
         append=append,
         exponent=hparams.weight_exponent,
         limit=hparams.weight_limit,
@@ -217,10 +220,7 @@ def log_likelihood(
     return getattr(objectives, hparams.objective)(demonstrations, background, append=append)
 
 
-def _score_pairs(
-    hparams: IRLHParams, batch: RewardBatch, r_d: jax.Array, absorbed: jax.Array | None
-) -> Scored:
-    del hparams
+def _score_pairs(batch: RewardBatch, r_d: jax.Array, absorbed: jax.Array | None) -> Scored:
     scored = Scored(r_d, objectives.log_weight(batch.log_density), batch.mask)
     if absorbed is None:
         return scored
@@ -231,7 +231,7 @@ def _score_pairs(
 
 
 def _score_trajectories(
-    hparams: IRLHParams, batch: RewardBatch, r_d: jax.Array, absorbed: jax.Array | None
+    batch: RewardBatch, r_d: jax.Array, absorbed: jax.Array | None, *, discount: Numeric
 ) -> Scored:
     mask, r_d = batch.mask, r_d.reshape(batch.mask.shape)
     some = jnp.any(mask, axis=-1)
@@ -239,7 +239,7 @@ def _score_trajectories(
         # The absorbing state takes the rest of the horizon.
         r_d = jnp.where(mask, r_d, absorbed)
         mask |= jnp.any(mask & batch.transition.terminated, axis=-1, keepdims=True)
-    total = objectives.returns(r_d, mask, hparams.discount)
+    total = objectives.returns(r_d, mask, discount)
     return Scored(total, objectives.log_weight(batch.log_density), some)
 
 
