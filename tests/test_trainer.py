@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmedirl_jax import hot_start, replay, seeds, training, updates
+from cmedirl_jax import hot_start, replay, seeds, training
 from cmedirl_jax.hot_start import HotStartHParams
 from cmedirl_jax.methods import METHODS, RewardNetworkSettings, Settings
 from cmedirl_jax.networks import Architecture
@@ -233,19 +233,6 @@ def test_r_star_is_stored_as_the_shaping_says(shaping, inputs):
     np.testing.assert_allclose(found.reward, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_a_terminated_transition_earns_what_the_absorbing_state_goes_on_to():
-    settings = with_(reward={"absorbing": True})
-    trainer, state, _ = start("me-ddpg", settings)
-    update = updates.make(trainer.algorithm, METHODS["me-ddpg"], settings)
-    reward = state.reward.replace(params=state.reward.params._replace(absorbing=jnp.asarray(0.3)))
-    batch = replay.unpack(ENV.spec, jnp.ones((2, 7)))._replace(terminated=jnp.array([False, True]))
-    shaped = update.shape(reward, batch, 0.9, 0.5)
-    r_d = trainer.algorithm.learner.reward(reward, batch.observation, batch.action)
-    absorbing = 0.1 * np.tanh(0.3)
-    expected = batch.reward + 0.5 * (r_d + np.array([0.0, 0.9 / (1 - 0.9) * absorbing]))
-    np.testing.assert_allclose(shaped.reward, expected, rtol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("objective", "weights"),
     [
@@ -293,14 +280,6 @@ def test_rewards_that_do_not_learn_stay_and_a_discriminator_does_not(method):
     same = [bool((a == b).all()) for a, b in pairs]
     assert not any(same) if method == "gail" else all(same)
     assert (log.reward is None) == (method != "gail")
-
-
-def test_behaviour_cloning_is_the_hot_start_alone():
-    _, state, advance = start("bc")
-    _, hot, _ = start("hs-ddpg")
-    chex.assert_trees_all_equal(state.agent.actor, hot.agent.actor)
-    with pytest.raises(ValueError, match="bc does not act"):
-        advance(state, 0, 5)
 
 
 def test_the_behaviour_cloning_term_fades_out_or_stays():
@@ -416,12 +395,6 @@ def test_branches_stay_branches_under_vmap(method, objective, weights):
     conditionals = [e for e in scan.params["jaxpr"].eqns if e.primitive.name == "cond"]
     # Learning the reward, learning at all.
     assert len(conditionals) == 2
-
-
-def test_methods_with_demonstrations_ask_for_them():
-    trainer, _, _ = compiled("hs-ddpg")
-    with pytest.raises(ValueError, match="hs-ddpg needs demonstrations"):
-        trainer.init(jax.random.key(0), None, 3)
 
 
 def test_hyperparameters_of_a_running_seed_can_be_changed():
