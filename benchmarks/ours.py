@@ -13,7 +13,9 @@ from cmedirl_jax.hot_start import HotStartHParams
 from cmedirl_jax.methods import METHODS, RewardNetworkSettings, Settings
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.schedules import RewardSchedule, Schedule
-from experiments import cells, judging
+from experiments import judging
+from experiments import programs as programs_lib
+from experiments.lanes import Lanes
 
 
 def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
@@ -36,12 +38,12 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
     )
     devices = jax.devices()[: workload.devices]
     group = workload.group or seeds.group_size(workload.seeds, len(devices), workload.hidden)
-    programs = cells.compile_method(
+    programs = programs_lib.compile_method(
         env,
         METHODS[workload.method],
         settings,
         judging.of_networks(env, settings.architecture, group, devices),
-        cells.compile_networks(env, settings.architecture, group, devices),
+        programs_lib.compile_networks(env, settings.architecture, group, devices),
         group=group,
         seeds_count=workload.seeds,
         devices=devices,
@@ -49,11 +51,11 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         subset_size=workload.n_demos,
     )
     data = hot_start.data(pool) if METHODS[workload.method].uses_demonstrations else None
-    key = jax.random.key(0)
-    lanes, state, _ = cells.begin(programs, key, data, workload.n_demos, workload.seeds)
+    lanes = Lanes(programs.lanes, workload.seeds, programs.group, programs.devices)
+    state = programs_lib.begin(programs, lanes, jax.random.key(0), data, workload.n_demos)
     running = np.arange(workload.seeds) < round(workload.running * workload.seeds)
     active = np.random.default_rng(0).permutation(running)
-    state, groups = cells.pack(programs, lanes, state, active)
+    state, groups = programs_lib.pack(programs, lanes, state, active)
     taken = 0
 
     def advance(steps: int) -> None:

@@ -1,6 +1,8 @@
 """Pytrees on disk, by orbax. The only file of the library that imports it."""
 
+import errno
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +16,34 @@ _MARK = "_CHECKPOINT_METADATA"
 def save(path: str | Path, tree: Any) -> None:
     """Write a pytree of arrays to the folder `path`; a whole one or none.
 
+    Under `jax.distributed` the calling process writes by itself, whatever the others do.
+
+    Args:
+        path: the folder; a checkpoint that is there is replaced.
+        tree: arrays that are wholly in this process, none of them empty.
+
     Raises:
         FileExistsError: if there is something at `path` that is not a checkpoint, to be replaced.
-        OSError: if the folder cannot be written.
+        OSError: if the folder cannot be written, or its disk has no room for the arrays.
     """
     path = os.path.abspath(path)
     if os.path.exists(path) and not _is_checkpoint(path):
         raise FileExistsError(f"{path}: exists and is not a checkpoint")
-    orbax.save(path, tree, overwrite=True)
+    parent = os.path.dirname(path)
+    os.makedirs(parent, exist_ok=True)
+    # Before orbax begins: where it runs out of room it leaves its traces and its complaints.
+    if shutil.disk_usage(parent).free < sum(leaf.nbytes for leaf in jax.tree.leaves(tree)):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+    context = orbax.Context()
+    context.multiprocessing.primary_host = jax.process_index()
+    context.multiprocessing.active_processes = {jax.process_index()}
+    try:
+        with context:
+            orbax.save(path, tree, overwrite=True)
+    except ValueError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path) from error
 
 
 def load(path: str | Path, like: Any = None) -> Any:

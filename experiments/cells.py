@@ -1,5 +1,6 @@
 """Training one cell of the grid: a method, a number of demonstrations, all seeds together."""
 
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -7,17 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import seeds, training
-from cmedirl_jax.envs import Env
 from cmedirl_jax.evaluation import Evaluation
 from cmedirl_jax.hot_start import HotStartData
-from cmedirl_jax.methods import METHODS, Method, Settings
-from cmedirl_jax.networks import Architecture
-from cmedirl_jax.training import Log, TrainingState
+from cmedirl_jax.training import TrainingState
 from experiments import judging
 from experiments.bookkeeping import Book, Budget, EpisodeRows, EvaluationRows
-from experiments.judging import Judge
+from experiments.checkpoints import Keeper, Snapshot
 from experiments.lanes import Lanes
+from experiments.programs import Programs, begin, pack
 
 CHUNK = 250
 """Steps per call of the compiled training loop, and so between looks at the seeds from the host."""
@@ -54,116 +52,6 @@ class CellResult(NamedTuple):
     final: Any
 
 
-class Programs(NamedTuple):
-    """The compiled functions of a method. Every cell of the method uses the same ones.
-
-    Attributes:
-        init: `(keys [lanes], groups, data, n_demonstrations) -> TrainingState` `[lanes, ...]`.
-        run: `(state, groups, data, steps, max_episodes) -> (TrainingState, Log)`; the state is
-            donated. Only the first `groups` groups of lanes on each device move.
-        permute: `(state, move [lanes]) -> TrainingState`; lane i takes lane move[i]'s. Donated too.
-        judge: noise-free rollouts.
-        lanes: how many seeds fit in.
-        group: lanes that are stepped together on a device.
-        devices: devices that share the lanes.
-    """
-
-    init: Callable[..., TrainingState]
-    run: Callable[..., tuple[TrainingState, Log]]
-    permute: Callable[[TrainingState, np.ndarray], TrainingState]
-    judge: Judge
-    lanes: int
-    group: int
-    devices: int
-
-
-def compile_networks(
-    env: Env, architecture: Architecture, group: int, devices: list[jax.Device]
-) -> Callable[[jax.Array, int], Any]:
-    """Jit the drawing of the networks that every method starts from: `(keys, groups) -> networks`.
-
-    Apart from `compile_method`, because the random numbers are most of what an `init` compiles.
-    """
-    trainer = training.make(env, METHODS["ddpg"], Settings(architecture), capacity=1)
-    drawn = seeds.step_groups(lambda key: (key, trainer.draw_networks(key)), group)
-
-    def draw(keys: jax.Array, groups: int) -> Any:
-        return seeds.map_devices(drawn, devices)(keys, groups)[1]
-
-    return jax.jit(draw, out_shardings=seeds.sharding(devices))
-
-
-def compile_method(
-    env: Env,
-    method: Method,
-    settings: Settings,
-    judge: Judge,
-    draw_networks: Callable[[jax.Array, int], Any],
-    *,
-    group: int,
-    seeds_count: int,
-    devices: list[jax.Device],
-    capacity: int,
-    subset_size: int | None,
-) -> Programs:
-    """Jit a method's training, over seeds in groups and over devices. Compiles at first use."""
-    trainer = training.make(env, method, settings, capacity=capacity, subset_size=subset_size)
-
-    def spread(function: Callable) -> Callable:
-        return seeds.map_devices(seeds.step_groups(function, group), devices)
-
-    def start(
-        keys: jax.Array, networks: Any, groups: int, data: HotStartData | None, n_demos: int
-    ) -> TrainingState:
-        def of_seed(drawn: tuple[jax.Array, Any], *shared: Any):
-            key, networks = drawn
-            return drawn, trainer.init(key, *shared, networks)
-
-        return spread(of_seed)((keys, networks), groups, data, n_demos)[1]
-
-    def permute(state: TrainingState, move: np.ndarray) -> TrainingState:
-        return jax.tree.map(lambda leaf: leaf[move], state)
-
-    # One sharding everywhere: another one, even if equivalent, would compile again.
-    split = seeds.sharding(devices)
-    start = jax.jit(start, out_shardings=split)
-
-    def init(
-        keys: jax.Array, groups: int, data: HotStartData | None, n_demonstrations: int
-    ) -> TrainingState:
-        return start(keys, draw_networks(keys, groups), groups, data, n_demonstrations)
-
-    return Programs(
-        init=init,
-        run=jax.jit(spread(trainer.run), donate_argnums=0, out_shardings=split),
-        permute=jax.jit(permute, donate_argnums=0, out_shardings=split),
-        judge=judge,
-        lanes=seeds.padded(seeds_count, group, len(devices)),
-        group=group,
-        devices=len(devices),
-    )
-
-
-def begin(
-    programs: Programs, key: jax.Array, data: HotStartData | None, n_demos: int, seeds_count: int
-) -> tuple[Lanes, TrainingState, int]:
-    """Initialise a cell's seeds: their lanes, their states, and how many groups hold them."""
-    lanes = Lanes(programs.lanes, seeds_count, programs.group, programs.devices)
-    groups = lanes.groups(np.ones(seeds_count, bool))
-    keys = seeds.keys(key, programs.lanes)[lanes.seed]
-    return lanes, programs.init(keys, groups, data, n_demos), groups
-
-
-def pack(
-    programs: Programs, lanes: Lanes, state: TrainingState, active: np.ndarray
-) -> tuple[TrainingState, int]:
-    """Bring the seeds `active` `[seeds]` to the front; how many groups hold them now."""
-    move = lanes.pack(active)
-    if move is not None:
-        state = programs.permute(state, move)
-    return state, lanes.groups(active)
-
-
 def train(
     programs: Programs,
     key: jax.Array,
@@ -174,74 +62,207 @@ def train(
     budget: Budget,
     threshold: float,
     report: Callable[[Progress], None],
+    keeper: Keeper | None = None,
 ) -> CellResult:
-    """Train a cell on `data` (None for a method without demonstrations), reporting each chunk."""
-    lanes, state, groups = begin(programs, key, data, n_demos, seeds_count)
-    book = Book(seeds_count, budget)
+    """Train a cell.
 
-    def of_seeds(tree: Any) -> Any:
-        """What lies in lanes, `[lanes, ...]`, as numpy `[seeds, ...]`."""
-        index = lanes.of_seed
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
+    Args:
+        programs: of the cell's method.
+        key: the cell's randomness.
+        data: the demonstrations; None for a method without.
+        n_demos: how many of them each seed draws.
+        seeds_count: how many seeds.
+        budget: how long they train, and when they are evaluated.
+        threshold: return that counts as solved, for the reports alone.
+        report: called where training begins or goes on from, and after each chunk.
+        keeper: saves the training as it goes, and has what was saved of it before.
 
-    def evaluate(starts: int) -> Evaluation:
-        found = programs.judge.on_starts(state.agent.actor, starts, groups)
-        return of_seeds(judging.summarise(found))
+    Raises:
+        Interrupted: by the keeper.
+    """
 
-    found = evaluate(budget.evaluation_starts)
-    best, best_return = _take(state.agent.actor, lanes.of_seed), jnp.asarray(found.return_mean)
-    book.evaluated("steps", np.arange(seeds_count), found)
-    report(Progress(0, book.solved_fraction(threshold)))
+    lanes = Lanes(programs.lanes, seeds_count, programs.group, programs.devices)
 
-    limit = None if budget.max_episodes is None else jnp.int32(budget.max_episodes)
-    for start, stop in _chunks(budget.max_steps, budget.evaluate_every):
+    def init() -> TrainingState:
+        return begin(programs, lanes, key, data, n_demos)
+
+    abstract = functools.cache(lambda: jax.eval_shape(init))
+    saved = None
+    if keeper is not None:
+        saved = keeper.load(lambda record: _Training.saved_like(abstract(), seeds_count, record))
+    if saved is None:
+        training = _Training.begin(programs, data, budget, lanes, init())
+    else:
+        training = _Training.go_on(programs, data, budget, lanes, abstract(), saved)
+    report(Progress(training.step, training.book.solved_fraction(threshold)))
+    for stop in _chunk_ends(training.step, budget):
+        if not training.book.running.any():
+            break
+        training.advance(stop)
+        report(Progress(stop, training.book.solved_fraction(threshold)))
+        if keeper is not None:
+            keeper.visit(stop, training.snapshot)
+    return training.result()
+
+
+class _Training:
+    """A cell in training: its seeds in their lanes, their record, and the best policy of each."""
+
+    def __init__(
+        self,
+        programs: Programs,
+        data: HotStartData | None,
+        book: Book,
+        lanes: Lanes,
+        state: TrainingState,
+    ):
+        self.programs, self.data, self.book = programs, data, book
+        self.lanes, self.state, self.step = lanes, state, 0
+        self.best: Any = None
+        self.best_return: Any = None
+
+    @classmethod
+    def begin(
+        cls,
+        programs: Programs,
+        data: HotStartData | None,
+        budget: Budget,
+        lanes: Lanes,
+        state: TrainingState,
+    ) -> "_Training":
+        training = cls(programs, data, Book(lanes.seeds, budget), lanes, state)
+        every = np.arange(lanes.seeds)
+        found = training._evaluate(budget.evaluation_starts, lanes.groups(every >= 0))
+        training.best = _take(state.agent.actor, lanes.of_seed)
+        training.best_return = jnp.asarray(found.return_mean)
+        training.book.evaluated("steps", every, found)
+        return training
+
+    @classmethod
+    def go_on(
+        cls,
+        programs: Programs,
+        data: HotStartData | None,
+        budget: Budget,
+        lanes: Lanes,
+        abstract: TrainingState,
+        saved: Snapshot,
+    ) -> "_Training":
+        lane_seed = saved.record.pop("lane_seed")
+        state = saved.state["training"]
+        if lane_seed.size == lanes.seed.size:
+            # Lane by lane as it was: elsewhere in its group a seed might round otherwise.
+            lanes.seed = lane_seed
+        else:
+            lane = np.argsort(lane_seed)[np.minimum(lanes.seed, lanes.seeds - 1)]
+            state = jax.tree.map(lambda leaf: leaf[lane], state)
+        state = jax.tree.map(_typed, abstract, state)
+        state = jax.device_put(state, programs.sharding)
+        training = cls(programs, data, Book.of_record(saved.record, budget), lanes, state)
+        training.step = saved.step
+        training.best, training.best_return = saved.state["best"], saved.state["best_return"]
+        return training
+
+    @staticmethod
+    def saved_like(
+        abstract: TrainingState, seeds_count: int, record: dict[str, np.ndarray]
+    ) -> dict[str, Any]:
+        """The tree that `snapshot` saved along with `record`, with shapes for arrays."""
+
+        def sized(count: int, tree: Any) -> Any:
+            return jax.tree.map(
+                lambda leaf: jax.ShapeDtypeStruct((count, *leaf.shape[1:]), leaf.dtype), tree
+            )
+
+        state = jax.eval_shape(lambda state: jax.tree.map(_untyped, state), abstract)
+        return {
+            "training": sized(record["lane_seed"].size, state),
+            "best": sized(seeds_count, state.agent.actor),
+            "best_return": jax.ShapeDtypeStruct((seeds_count,), jnp.float32),
+        }
+
+    def snapshot(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """State and record, on the host and apart from what training writes over."""
+        tree = {
+            "training": jax.tree.map(_untyped, self.state),
+            "best": self.best,
+            "best_return": self.best_return,
+        }
+        record = {"lane_seed": self.lanes.seed, **self.book.record()}
+        return jax.tree.map(np.array, tree), record
+
+    def advance(self, stop: int) -> None:
+        """Take the steps up to `stop`, and evaluate the seeds that are due."""
+        book, budget, lanes = self.book, self.book.budget, self.lanes
         active = book.running | (book.pending & ~book.diverged)
-        state, groups = pack(programs, lanes, state, active)
-        steps = jnp.arange(start, stop, dtype=jnp.int32)
-        state, log = programs.run(state, groups, data, steps, limit)
+        self.state, groups = pack(self.programs, lanes, self.state, active)
+        limit = None if budget.max_episodes is None else jnp.int32(budget.max_episodes)
+        steps = jnp.arange(self.step, stop, dtype=jnp.int32)
+        self.state, log = self.programs.run(self.state, groups, self.data, steps, limit)
+        self.step = stop
         was_running = book.running.copy()
-        book.mark_diverged(of_seeds(_finite(state)))
-        book.stepped(steps=np.asarray(steps), log=of_seeds(log))
+        book.mark_diverged(self._of_seeds(_finite(self.state)))
+        book.stepped(steps=np.asarray(steps), log=self._of_seeds(log))
         due = np.flatnonzero(book.due_by_episodes() & ~book.diverged)
         if due.size:
-            book.evaluated("episodes", due, evaluate(budget.evaluation_starts_episodes))
+            found = self._evaluate(budget.evaluation_starts_episodes, groups)
+            book.evaluated("episodes", due, found)
         book.pending |= was_running
         over = stop == budget.max_steps or not book.running.any()
         if stop % budget.evaluate_every == 0 or over:
-            found = evaluate(budget.evaluation_starts)
+            found = self._evaluate(budget.evaluation_starts, groups)
             due = np.flatnonzero(book.pending & ~book.diverged)
             book.evaluated("steps", due, found)
             book.pending[:] = False
-            returns = np.full(seeds_count, -np.inf, found.return_mean.dtype)
+            returns = np.full(lanes.seeds, -np.inf, found.return_mean.dtype)
             returns[due] = found.return_mean[due]
-            actor = _take(state.agent.actor, lanes.of_seed)
-            best, best_return = _keep_best(best, best_return, actor, returns)
-        report(Progress(stop, book.solved_fraction(threshold)))
-        if over:
-            break
+            actor = _take(self.state.agent.actor, lanes.of_seed)
+            self.best, self.best_return = _keep_best(self.best, self.best_return, actor, returns)
 
-    return CellResult(
-        evaluations=book.evaluations,
-        episodes=book.episode_rows(),
-        best=jax.tree.map(np.asarray, best),
-        reward=None if state.reward is None else of_seeds(state.reward.params),
-        env_steps=book.env_step,
-        demonstration_steps=np.zeros(seeds_count, np.int32)
-        if state.subset is None
-        else of_seeds(state.subset.length).sum(axis=1),
-        diverged=book.diverged,
-        final=of_seeds(state.agent.actor),
-    )
+    def result(self) -> CellResult:
+        book, state = self.book, self.state
+        return CellResult(
+            evaluations=book.evaluations,
+            episodes=book.episode_rows(),
+            best=jax.tree.map(np.asarray, self.best),
+            reward=None if state.reward is None else self._of_seeds(state.reward.params),
+            env_steps=book.env_step,
+            demonstration_steps=np.zeros(self.lanes.seeds, np.int32)
+            if state.subset is None
+            else self._of_seeds(state.subset.length).sum(axis=1),
+            diverged=book.diverged,
+            final=self._of_seeds(state.agent.actor),
+        )
+
+    def _of_seeds(self, tree: Any) -> Any:
+        """What lies in lanes, `[lanes, ...]`, as numpy `[seeds, ...]`."""
+        index = self.lanes.of_seed
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
+
+    def _evaluate(self, starts: int, groups: int) -> Evaluation:
+        found = self.programs.judge.on_starts(self.state.agent.actor, starts, groups)
+        return self._of_seeds(judging.summarise(found))
 
 
-def _chunks(max_steps: int, evaluate_every: int) -> Iterator[tuple[int, int]]:
-    """Step ranges of at most `CHUNK` that end at every multiple of `evaluate_every`."""
-    start = 0
-    while start < max_steps:
-        next_evaluation = (start // evaluate_every + 1) * evaluate_every
-        stop = min(start + CHUNK, next_evaluation, max_steps)
-        yield start, stop
-        start = stop
+def _chunk_ends(step: int, budget: Budget) -> Iterator[int]:
+    """Where the chunks after `step` end: `CHUNK` steps at most, none across an evaluation."""
+    while step < budget.max_steps:
+        next_evaluation = (step // budget.evaluate_every + 1) * budget.evaluate_every
+        step = min(step + CHUNK, next_evaluation, budget.max_steps)
+        yield step
+
+
+def _untyped(leaf: jax.Array) -> jax.Array:
+    """Random keys as their data, which can be saved."""
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def _typed(like: jax.ShapeDtypeStruct, array: np.ndarray) -> Any:
+    return jax.random.wrap_key_data(array) if _is_key(like) else array
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 @jax.jit

@@ -13,9 +13,11 @@ from cmedirl_jax.envs import Env
 from cmedirl_jax.types import Transition
 from experiments import cells
 from experiments.bookkeeping import Budget
-from experiments.cells import Programs, Progress
+from experiments.cells import Progress
+from experiments.checkpoints import Keeper
 from experiments.errors import UserError
 from experiments.presets import Expert, ExpertSettings
+from experiments.programs import Programs
 
 EVALUATION_STARTS = 100
 """Start states on which the experts are ranked."""
@@ -28,6 +30,7 @@ def make_pool(
     which: Expert,
     programs: Programs,
     report: Callable[[Progress], None],
+    keeper: Keeper | None = None,
 ) -> Demonstrations:
     """Train experts and record noise-free trajectories, from fresh random starts.
 
@@ -38,8 +41,10 @@ def make_pool(
         which: who demonstrates, see `choose`.
         programs: DDPG's, with the settings that experts train with.
         report: called after each chunk of training.
+        keeper: saves the training as it goes.
 
     Raises:
+        Interrupted: by the keeper.
         UserError: if no expert's final policy reaches the environment's threshold.
     """
     train_key, start_key = jax.random.split(key)
@@ -53,6 +58,7 @@ def make_pool(
         budget=Budget(options.steps, None, options.steps, EVALUATION_STARTS),
         threshold=threshold,
         report=report,
+        keeper=keeper,
     )
     final = result.evaluations[-1]
     returns = np.where(result.diverged, -np.inf, 0.0)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -28,12 +29,15 @@ from experiments import (
     tables,
     tabular_cells,
 )
+from experiments import programs as programs_lib
 from experiments.bookkeeping import Budget
-from experiments.cells import Programs
+from experiments.checkpoints import Keeper
 from experiments.errors import UserError
+from experiments.interruption import Interruption
 from experiments.judging import Judge
 from experiments.planning import Cell
 from experiments.presets import Grid
+from experiments.programs import Programs
 from experiments.progress import Reporter, reporter
 
 FRESH_STARTS = 100
@@ -48,45 +52,67 @@ class Keys(NamedTuple):
     fresh_starts: jax.Array
 
 
-def run(grid: Grid, devices: list[jax.Device], console: Console) -> pl.DataFrame:
+class _Session(NamedTuple):
+    """What a run is given once and its parts share."""
+
+    grid: Grid
+    env: Env
+    keys: Keys
+    folder: Path
+    devices: list[jax.Device]
+    console: Console
+    interruption: Interruption
+
+    def keeper(self, name: str) -> Keeper:
+        """What saves the training that is called `name`."""
+        return Keeper(
+            self.folder / "checkpoints" / name,
+            results.identity(self.grid),
+            every=self.grid.checkpoint_every,
+            interruption=self.interruption,
+            say=lambda line: self.console.print(line, highlight=False, soft_wrap=True),
+        )
+
+
+def run(
+    grid: Grid, devices: list[jax.Device], console: Console, interruption: Interruption
+) -> pl.DataFrame:
     """Do what is left of a run; returns its summary.
 
     Raises:
         UserError: for a configuration, a folder or a file that cannot work.
+        Interrupted: if a signal came; what was reached is saved.
+        OSError: if a file could not be written; what was finished stays.
     """
     planning.check(grid)
     env = envs.make(grid.env)
     given = None if grid.demos is None else planning.load_demonstrations(grid, env)
-    results.check_folder(grid)
-    folder = grid.folder
     keys = Keys(*jax.random.split(jax.random.key(grid.seed), 3))
     plan = planning.cells_of(grid)
-    done = results.finished(folder)
-    todo = [cell for cell in plan if (cell.method.name, cell.n_demos) not in done]
-    if todo:
-        kind = devices[0].platform.upper()
-        console.print(f"{grid.seeds} seeds per cell on {len(devices)} {kind} device(s)")
-        with compilation.counted() as cost:
-            _train_cells(grid, env, keys, given, todo, devices, console)
-        console.print(
-            f"Compilation took {cost.seconds:.1f} s; {cost.hits} programs came from the cache, "
-            f"{cost.misses} did not",
-            highlight=False,
-        )
-    return _conclude(grid, env, folder, plan, redraw=bool(todo))
+    with results.opened(grid) as folder:
+        done = results.finished(folder)
+        todo = [cell for cell in plan if (cell.method.name, cell.n_demos) not in done]
+        session = _Session(grid, env, keys, folder, devices, console, interruption)
+        if todo:
+            kind = devices[0].platform.upper()
+            console.print(f"{grid.seeds} seeds per cell on {len(devices)} {kind} device(s)")
+            for name, version in results.other_versions(folder).items():
+                console.print(f"This run was begun with {name} {version}", highlight=False)
+            with compilation.counted() as cost:
+                _train_cells(session, given, todo)
+            console.print(
+                f"Compilation took {cost.seconds:.1f} s; {cost.hits} programs came from the cache, "
+                f"{cost.misses} did not",
+                highlight=False,
+            )
+        shutil.rmtree(folder / "checkpoints", ignore_errors=True)
+        return _conclude(grid, env, folder, plan, redraw=bool(todo))
 
 
-def _train_cells(
-    grid: Grid,
-    env: Env,
-    keys: Keys,
-    given: Demonstrations | None,
-    todo: list[Cell],
-    devices: list[jax.Device],
-    console: Console,
-) -> None:
+def _train_cells(session: _Session, given: Demonstrations | None, todo: list[Cell]) -> None:
+    grid, env, keys, folder, devices, console, interruption = session
     budget = planning.budget_of(grid, env)
-    pool_path = grid.folder / "demonstrations" / "pool.npz"
+    pool_path = folder / "demonstrations" / "pool.npz"
     needs_pool = any(cell.n_demos for cell in todo)
     pool = given if given is not None else _reusable(pool_path, env)
     trains_experts = needs_pool and pool is None
@@ -106,10 +132,14 @@ def _train_cells(
     with reporter(console, len(todo) + trains_experts, total) as report:
         if trains_experts:
             report.start(f"experts, {grid.experts.seeds} seeds")
-            advance = _stepwise(report, grid.experts.seeds)
-            programs = compile_method(METHODS["ddpg"], Settings())
             pool = experts.make_pool(
-                keys.experts, env, grid.experts, grid.expert, programs, advance
+                keys.experts,
+                env,
+                grid.experts,
+                grid.expert,
+                compile_method(METHODS["ddpg"], Settings()),
+                _stepwise(report, grid.experts.seeds),
+                session.keeper("experts"),
             )
         data, metadata = None, {}
         if pool is not None:
@@ -117,13 +147,13 @@ def _train_cells(
             agent = grid.settings.agent
             data = hot_start.data(pool, agent.discount, agent.reward_scale)
             metadata = pool.metadata
-        # Only now: a refusal, or a run stopped among the experts, leaves nothing behind.
-        folder = results.open_folder(grid)
         if pool is not None and not pool_path.exists():
             pool_path.parent.mkdir(exist_ok=True)
             demonstrations.save(pool_path, pool)
         for cell in todo:
+            interruption.obey()
             report.start(f"{cell.name}, {grid.seeds} seeds")
+            keeper = session.keeper(cell.name)
             if cell.method.tabular is None or cell.method.interacts:
                 programs = compile_method(cell.method, grid.settings)
                 result = cells.train(
@@ -137,6 +167,7 @@ def _train_cells(
                     else dataclasses.replace(budget, max_steps=0),
                     threshold=env.spec.reward_threshold,
                     report=_stepwise(report, grid.seeds),
+                    keeper=keeper,
                 )
             else:
                 programs = compile_tabular(cell.method)
@@ -148,6 +179,7 @@ def _train_cells(
                     cell.n_demos,
                     seeds_count=grid.seeds,
                     evaluation_starts=grid.evaluation_starts,
+                    keeper=keeper,
                 )
             fresh = programs.judge.on_fresh_starts(result.best, keys.fresh_starts, FRESH_STARTS)
             rows = tables.rows(
@@ -161,10 +193,12 @@ def _train_cells(
                 replay=gymnasium_replay.replay(programs.judge, result.best, env),
                 expert_steps=metadata.get("expert_env_steps", 0) if cell.n_demos else 0,
             )
+            keeper.wait()
             checkpoint.save(folder / "policies" / cell.name, result.best)
             if result.reward is not None:
                 checkpoint.save(folder / "rewards" / cell.name, result.reward)
             results.append(folder, rows)
+            keeper.remove()
 
 
 def _compiler(
@@ -185,11 +219,11 @@ def _compiler(
 
     @functools.cache
     def draw_networks(architecture: Architecture) -> Callable:
-        return cells.compile_networks(env, architecture, group(architecture), devices)
+        return programs_lib.compile_networks(env, architecture, group(architecture), devices)
 
     @functools.cache
     def compile_method(method: Method, settings: Settings) -> Programs:
-        return cells.compile_method(
+        return programs_lib.compile_method(
             env,
             method,
             settings,
@@ -216,11 +250,14 @@ def _reusable(path: Path, env: Env) -> Demonstrations | None:
 
 def _stepwise(report: Reporter, seeds_count: int) -> Callable[[cells.Progress], None]:
     """Turn a cell's progress, which counts from its start, into increments."""
-    before = 0
+    before: int | None = None
 
     def advance(progress: cells.Progress) -> None:
         nonlocal before
-        report.advance((progress.env_step - before) * seeds_count, progress.solved_fraction)
+        if before is None:
+            report.go_on(progress.env_step * seeds_count)
+        else:
+            report.advance((progress.env_step - before) * seeds_count, progress.solved_fraction)
         before = progress.env_step
 
     return advance

@@ -66,6 +66,8 @@ class Grid:
     """CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU."""
     group: int | None = None
     """Seeds that a device steps together; default: what is fastest for the networks' width."""
+    checkpoint_every: float = 60.0
+    """Seconds from one checkpoint of the training to the next; 0: one after every chunk."""
     experts: ExpertSettings = ExpertSettings()
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
 

@@ -19,6 +19,10 @@ class Reporter(Protocol):
         """A part of the run begins."""
         ...
 
+    def go_on(self, learning_steps: int) -> None:
+        """The part has so many learning steps behind it from before."""
+        ...
+
     def advance(self, learning_steps: int, solved_fraction: float) -> None:
         """The part took so many more learning steps; this share of its seeds is solving."""
         ...
@@ -53,6 +57,11 @@ class _Live:
         description = f"[{self.part}/{self.parts}] {name} (compiling)"
         self.progress.update(self.task, description=description)
 
+    def go_on(self, learning_steps: int) -> None:
+        total = self.progress.tasks[0].total
+        assert total is not None
+        self.progress.update(self.task, total=total - learning_steps)
+
     def advance(self, learning_steps: int, solved_fraction: float) -> None:
         speed = self.progress.tasks[0].speed
         self.progress.update(
@@ -74,6 +83,11 @@ class _Plain:
     def start(self, name: str) -> None:
         self.part, self.name = self.part + 1, name
         self._print(f"[{self.part}/{self.parts}] {name}")
+
+    def go_on(self, learning_steps: int) -> None:
+        self.total -= learning_steps
+        if learning_steps:
+            self._print(f"{self.name} goes on from its checkpoint")
 
     def advance(self, learning_steps: int, solved_fraction: float) -> None:
         self.done += learning_steps

@@ -8,25 +8,32 @@ import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
+import io
 import json
 import math
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import filelock
 import polars as pl
 
 from experiments.errors import UserError
 from experiments.presets import Grid
 
 SCHEMA = 1
-PACKAGES = ("jax", "jaxlib", "flax", "optax", "chex", "gymnasium", "numpy", "orbax-checkpoint")
+PACKAGES = (
+    *("cmedirl-jax", "jax", "jaxlib", "flax", "optax"),
+    *("chex", "gymnasium", "numpy", "orbax-checkpoint"),
+)
 TABLES = ("seeds", "episodes", "evaluations")
 """In the order they are written."""
 
-_NOT_COMPARED = ("out", "devices")
+_LOCK = ".lock"
+_NOT_COMPARED = ("out", "devices", "checkpoint_every")
 
 
 def describe(grid: Grid) -> dict[str, Any]:
@@ -59,25 +66,85 @@ def check_folder(grid: Grid) -> None:
         raise UserError(f"--out: cannot write to {folder} ({error.strerror})") from error
 
 
-def open_folder(grid: Grid) -> Path:
-    """Make the run's folder with its config.json, or enter it again.
+@contextlib.contextmanager
+def opened(grid: Grid) -> Iterator[Path]:
+    """The run's folder with its config.json, held against other processes while in use.
+
+    A `UserError` before the first cell is finished leaves what was there before, and nothing else.
 
     Raises:
-        UserError: as `check_folder`.
+        UserError: as `check_folder`, and if another process holds the folder.
     """
     check_folder(grid)
     folder = grid.folder
-    path = folder / "config.json"
+    made = [path for path in (folder, *folder.absolute().parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"--out: cannot write to {folder} ({error.strerror})") from error
+    before = set(folder.iterdir())
+    with _held(folder):
+        try:
+            _clean(folder)
+            _configure(grid)
+            yield folder
+        except UserError:
+            if not (folder / "evaluations.parquet").exists():
+                for path in set(folder.iterdir()) - before:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+                for path in made:
+                    path.rmdir()
+            raise
+
+
+@contextlib.contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    # The operating system gives the lock up when its process ends, however that ends.
+    lock = filelock.FileLock(folder / _LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except filelock.Timeout as error:
+        raise UserError(f"--out: another process is at work in {folder}") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _clean(folder: Path) -> None:
+    """Remove what a process that was killed while writing left behind."""
+    for pattern in (".*.partial", "*/*.partial", "*/*.orbax-checkpoint-tmp*"):
+        for path in folder.glob(pattern):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def _configure(grid: Grid) -> None:
+    path = grid.folder / "config.json"
     if not path.exists():
-        versions = {name: importlib.metadata.version(name) for name in PACKAGES}
-        config = {"schema": SCHEMA, "config": describe(grid), "versions": versions}
+        config = {"schema": SCHEMA, "config": describe(grid), "versions": versions()}
         with replacing(path) as partial:
             partial.write_text(json.dumps(config, indent=2) + "\n")
-    return folder
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that a run's numbers depend on."""
+    return {name: importlib.metadata.version(name) for name in PACKAGES}
+
+
+def other_versions(folder: Path) -> dict[str, str]:
+    """The versions that began the run, of packages which have another one now."""
+    began = json.loads((folder / "config.json").read_text())["versions"]
+    now = versions()
+    return {name: version for name, version in began.items() if now.get(name) != version}
+
+
+def identity(grid: Grid) -> dict[str, Any]:
+    """What a checkpoint must share with a run that goes on from it."""
+    compared = {
+        name: value for name, value in _flat(describe(grid)).items() if name not in _NOT_COMPARED
+    }
+    digest = hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()
+    return {"config": digest, **versions()}
 
 
 def _compare(path: Path, config: dict[str, Any]) -> None:
@@ -129,8 +196,11 @@ def append(folder: Path, rows: dict[str, pl.DataFrame]) -> None:
     for name in TABLES:
         before = read(folder, name)
         table = rows[name] if before is None else pl.concat([before, rows[name]])
+        # Through memory: a full disk is an OSError then, not one of polars' own.
+        buffer = io.BytesIO()
+        table.write_parquet(buffer)
         with replacing(folder / f"{name}.parquet") as partial:
-            table.write_parquet(partial)
+            partial.write_bytes(buffer.getvalue())
 
 
 @contextlib.contextmanager

@@ -14,10 +14,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from experiments import compilation, planning
+from experiments import compilation, interruption, planning
 from experiments import grid as grid_lib
 from experiments.errors import UserError
+from experiments.interruption import Interrupted
 from experiments.presets import PRESETS, Grid
+
+_CONTINUE = "start the same command again to go on"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,10 +34,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Before anything else: the first array that JAX makes fixes the number of CPU devices.
         devices = start_devices(grid)
         planning.check(grid)
-        summary = grid_lib.run(grid, devices, console)
+        with interruption.noted() as signals:
+            summary = grid_lib.run(grid, devices, console, signals)
     except UserError as error:
-        print(f"run_grid: {error}", file=sys.stderr)
-        return 2
+        return _end(2, str(error))
+    except Interrupted as error:
+        return _end(error.exit_code, f"stopped by {error}; {_CONTINUE}")
+    except KeyboardInterrupt:
+        return _end(130, f"stopped at once; {_CONTINUE}")
+    except OSError as error:
+        return _end(1, f"{error}; what is finished is kept: {_CONTINUE}")
     console.print(summary_table(summary))
     difference = summary["gymnasium_difference_max"].max()
     console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
@@ -42,6 +51,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         console.print(f"Seeds that diverged and were stopped: {summary['diverged'].sum()}")
     console.print(f"Tables and figures: {grid.folder}", highlight=False, soft_wrap=True)
     return 0
+
+
+def _end(exit_code: int, line: str) -> int:
+    print(f"run_grid: {line}", file=sys.stderr)
+    return exit_code
 
 
 def parse(arguments: Sequence[str]) -> Grid:

@@ -17,6 +17,7 @@ from cmedirl_jax.tabular.discretise import FiniteMDP
 from experiments import judging
 from experiments.bookkeeping import EpisodeRows, EvaluationRows, Means
 from experiments.cells import CellResult
+from experiments.checkpoints import Keeper
 from experiments.judging import Judge
 
 
@@ -100,14 +101,50 @@ def train(
     *,
     seeds_count: int,
     evaluation_starts: int,
+    keeper: Keeper | None = None,
 ) -> CellResult:
-    """Fit every seed and evaluate its greedy policy, and as protocol "soft" its soft one, once."""
-    keys = seeds.keys(key, seeds.padded(seeds_count, 1, programs.devices))
-    fitted = jax.tree.map(
-        lambda leaf: np.asarray(leaf)[:seeds_count],
-        programs.fit(keys, programs.mdp, data, n_demos),
-    )
-    table = fitted.log_probabilities
+    """Fit every seed and evaluate its greedy policy, and as protocol "soft" its soft one, once.
+
+    Args:
+        programs: of the cell's method.
+        key: the cell's randomness.
+        data: the demonstrations.
+        n_demos: how many of them each seed draws.
+        seeds_count: how many seeds.
+        evaluation_starts: start states of the evaluations.
+        keeper: saves the seeds that are fitted, and has what was saved of them before.
+
+    Raises:
+        Interrupted: by the keeper.
+    """
+    # A seed takes seconds: each device fits one between looks from the host.
+    keys = seeds.keys(key, seeds_count + programs.devices)
+    parts: list[Fitted] = []
+
+    def fit(keys: jax.Array) -> Fitted:
+        return programs.fit(keys, programs.mdp, data, n_demos)
+
+    def abstract(record: dict[str, np.ndarray]) -> Fitted:
+        one = jax.eval_shape(fit, keys[: programs.devices])
+        return jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct((int(record["fitted"]), *leaf.shape[1:]), leaf.dtype),
+            one,
+        )
+
+    def take() -> tuple[Fitted, dict[str, np.ndarray]]:
+        fitted = _joined(parts)
+        return fitted, {"fitted": np.array(len(fitted.reward))}
+
+    fitted = 0
+    if keeper is not None and (saved := keeper.load(abstract)) is not None:
+        fitted = saved.step
+        parts.append(saved.state)
+    for first in range(fitted, seeds_count, programs.devices):
+        parts.append(jax.tree.map(np.asarray, fit(keys[first : first + programs.devices])))
+        if keeper is not None:
+            keeper.visit(first + programs.devices, take)
+    found = jax.tree.map(lambda leaf: leaf[:seeds_count], _joined(parts))
+    table = found.log_probabilities
     every = np.arange(seeds_count)
     zeros = np.zeros(seeds_count, np.int32)
     unknown = Means(*(np.full(seeds_count, np.nan) for _ in Means._fields))
@@ -124,9 +161,13 @@ def train(
         evaluations=[rows("steps", greedy), rows("soft", soft)],
         episodes=EpisodeRows(*(nothing for _ in EpisodeRows._fields)),
         best=table,
-        reward=fitted.reward,
+        reward=found.reward,
         env_steps=zeros,
-        demonstration_steps=fitted.demonstration_steps,
-        diverged=~np.isfinite(fitted.reward).all(axis=(1, 2)),
+        demonstration_steps=found.demonstration_steps,
+        diverged=~np.isfinite(found.reward).all(axis=(1, 2)),
         final=table,
     )
+
+
+def _joined(parts: list[Fitted]) -> Fitted:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

@@ -16,7 +16,7 @@ from benchmarks.peers import PEERS
 from benchmarks.serving import Worker
 from benchmarks.workload import Workload
 from cmedirl_jax.methods import PAPER_METHODS
-from experiments import cells
+from experiments import programs
 from tests import pools
 
 TINY = {"seeds": 3, "hidden": (4, 4), "batch": 4}
@@ -111,19 +111,19 @@ def test_a_workload_advances_all_its_seeds(variant, method):
 
 def test_every_timed_step_learns(monkeypatch):
     logs = []
-    compile_method = cells.compile_method
+    compile_method = programs.compile_method
 
     def compile_and_listen(*args, **kwargs):
-        programs = compile_method(*args, **kwargs)
+        compiled = compile_method(*args, **kwargs)
 
         def run(*args):
-            state, log = programs.run(*args)
+            state, log = compiled.run(*args)
             logs.append(log)
             return state, log
 
-        return programs._replace(run=run)
+        return compiled._replace(run=run)
 
-    monkeypatch.setattr(cells, "compile_method", compile_and_listen)
+    monkeypatch.setattr(programs, "compile_method", compile_and_listen)
     ours.start(Workload(**TINY), pools.scripted())(5)
     assert np.all(logs[0].learned)
     assert np.all(np.asarray(logs[0].critic_loss)[:, 1:] > 0.0)

@@ -12,6 +12,7 @@ from cmedirl_jax.networks import Architecture
 from cmedirl_jax.schedules import Schedule
 from cmedirl_jax.training import Log
 from experiments import cells, judging
+from experiments import programs as programs_lib
 from experiments.bookkeeping import Budget
 from experiments.cells import CellResult, Progress
 
@@ -56,12 +57,12 @@ def programs(env):
         schedule=Schedule(batch_size=4, learning_starts=LEARNING_STARTS),
     )
     devices = jax.devices()[:1]
-    return cells.compile_method(
+    return programs_lib.compile_method(
         short,
         METHODS["ddpg"],
         settings,
         judging.of_networks(short, settings.architecture, 2, devices),
-        cells.compile_networks(short, settings.architecture, 2, devices),
+        programs_lib.compile_networks(short, settings.architecture, 2, devices),
         group=2,
         seeds_count=SEEDS,
         devices=devices,

@@ -201,7 +201,8 @@ def test_a_folder_that_cannot_be_made_is_refused(refused, tmp_path, out):
 )
 def test_another_configuration_in_the_same_folder_is_refused(refused, option, before, now):
     arguments = (*SMOKE, "--out", "run")
-    results.open_folder(run_grid.parse(arguments))
+    with results.opened(run_grid.parse(arguments)):
+        pass
     line = refused(*arguments, option, now)
     assert line.startswith(f"--out: run holds a run with {option} {before}, not {now};")
 

@@ -1,0 +1,218 @@
+"""A cell's training on disk: saved as it goes, the last two kept, the newest whole one loaded.
+
+A checkpoint is a folder, `checkpoints/CELL/STEP`, that appears in one move when it is complete:
+
+    state/          the device's arrays, by orbax
+    record.npz      the host's arrays
+    manifest.json   what wrote it, and the digest of every file
+
+A checkpoint whose files are not those of its manifest is never read further.
+"""
+
+import concurrent.futures
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from cmedirl_jax import checkpoint
+from experiments.errors import UserError
+from experiments.interruption import Interruption
+
+SCHEMA = 1
+KEPT = 2
+_PARTIAL = ".partial"
+
+
+class Snapshot(NamedTuple):
+    """All that a cell's training goes on from, on the host.
+
+    Attributes:
+        step: how far it is.
+        state: a pytree of numpy arrays, none of them empty.
+        record: further arrays by name.
+    """
+
+    step: int
+    state: Any
+    record: dict[str, np.ndarray]
+
+
+class Keeper:
+    """Keeps one cell's training while it runs.
+
+    Saving goes on in the background, one checkpoint at a time. A checkpoint that cannot be written
+    is reported and done without: those before it stay.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        identity: dict[str, Any],
+        *,
+        every: float,
+        interruption: Interruption,
+        say: Callable[[str], None],
+    ):
+        """Keep a cell in `folder`, which need not be there yet.
+
+        Args:
+            folder: `checkpoints/CELL`.
+            identity: JSON values that must be equal for a checkpoint to be gone on from.
+            every: seconds from one checkpoint to the next.
+            interruption: obeyed once what was reached is saved.
+            say: called with a line for the user.
+        """
+        self.folder, self.identity, self.every = folder, identity, every
+        self._interruption, self._say = interruption, say
+        self._saving = concurrent.futures.ThreadPoolExecutor(max_workers=1)
+        self._pending: concurrent.futures.Future[None] | None = None
+        self._due = time.monotonic() + every
+        self._saved: int | None = None
+
+    def load(self, like: Callable[[dict[str, np.ndarray]], Any]) -> Snapshot | None:
+        """The newest checkpoint that is whole; those that are not are reported and removed.
+
+        Args:
+            like: the abstract state (as `jax.eval_shape` gives it) that belongs to a record.
+
+        Raises:
+            UserError: if one was written by a version with another schema.
+        """
+        for path in _newest_first(self.folder):
+            try:
+                found = _read(path, self.identity, like)
+            except _Unusable as reason:
+                self._say(f"{path} {reason}: going back to the one before, if there is one")
+                shutil.rmtree(path)
+                continue
+            self._saved = found.step
+            return found
+        return None
+
+    def visit(self, step: int, take: Callable[[], tuple[Any, dict[str, np.ndarray]]]) -> None:
+        """Save if it is time or a signal came.
+
+        Args:
+            step: how far the training is.
+            take: gives the state and the record to save, which nobody writes over after.
+
+        Raises:
+            Interrupted: if a signal came, after saving.
+        """
+        if self._interruption.signal is None and time.monotonic() < self._due:
+            return
+        self.wait()
+        if self._saved != step:
+            snapshot = Snapshot(step, *take())
+            self._pending = self._saving.submit(_write, self.folder, self.identity, snapshot)
+            self._saved = step
+        self._due = time.monotonic() + self.every
+        if self._interruption.signal is not None:
+            self.wait()
+            self._interruption.obey()
+
+    def wait(self) -> None:
+        """Wait until the last checkpoint is on disk."""
+        if self._pending is None:
+            return
+        try:
+            self._pending.result()
+        except OSError as error:
+            self._saved = None
+            self._say(f"no checkpoint could be saved in {self.folder} ({error.strerror})")
+        self._pending = None
+
+    def remove(self) -> None:
+        """Remove every checkpoint: the cell is finished."""
+        self.wait()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+class _Unusable(Exception):
+    """Why a checkpoint cannot be gone on from."""
+
+
+def _newest_first(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    steps = [path for path in folder.iterdir() if path.name.isdecimal()]
+    return sorted(steps, key=lambda path: int(path.name), reverse=True)
+
+
+def _write(folder: Path, identity: dict[str, Any], snapshot: Snapshot) -> None:
+    partial = folder / _PARTIAL
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        checkpoint.save(partial / "state", snapshot.state)
+        with (partial / "record.npz").open("wb") as file:
+            np.savez(file, allow_pickle=False, **snapshot.record)
+        manifest = {"schema": SCHEMA, "identity": identity, "files": _digests(partial)}
+        sealed = {**manifest, "sha256": _digest_of(manifest)}
+        (partial / "manifest.json").write_text(json.dumps(sealed, indent=2) + "\n")
+        os.replace(partial, folder / str(snapshot.step))
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    for old in _newest_first(folder)[KEPT:]:
+        shutil.rmtree(old)
+
+
+def _read(
+    path: Path, identity: dict[str, Any], like: Callable[[dict[str, np.ndarray]], Any]
+) -> Snapshot:
+    try:
+        manifest = json.loads((path / "manifest.json").read_bytes())
+        digest = manifest.pop("sha256")
+        intact = digest == _digest_of(manifest)
+        schema, written, files = (manifest[name] for name in ("schema", "identity", "files"))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise _Unusable("is damaged (manifest.json)") from error
+    if not intact:
+        raise _Unusable("is damaged (manifest.json)")
+    if schema != SCHEMA:
+        raise UserError(
+            f"--out: {path} has schema {schema!r}, this version reads {SCHEMA}; go on with the "
+            "version that wrote it, or remove it"
+        )
+    try:
+        found = _digests(path)
+    except OSError as error:
+        raise _Unusable(f"cannot be read ({error.strerror})") from error
+    for name in sorted(files.keys() | found.keys()):
+        if files.get(name) != found.get(name):
+            raise _Unusable(f"is damaged ({name})")
+    for name in sorted(written.keys() | identity.keys()):
+        if written.get(name) != identity.get(name):
+            raise _Unusable(
+                f"was written with {name} {written.get(name)}, not {identity.get(name)}"
+            )
+    with np.load(path / "record.npz", allow_pickle=False) as archive:
+        record = dict(archive)
+    try:
+        state = checkpoint.load(path / "state", like(record))
+    except ValueError as error:
+        raise _Unusable("holds another structure") from error
+    return Snapshot(int(path.name), jax.tree.map(np.asarray, state), record)
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """The digest of every file below `folder` but the manifest."""
+    digests = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.name != "manifest.json":
+            with path.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            digests[path.relative_to(folder).as_posix()] = digest
+    return digests
+
+
+def _digest_of(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
