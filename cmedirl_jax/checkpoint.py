@@ -9,6 +9,8 @@ from typing import Any
 import jax
 from orbax.checkpoint import v1 as orbax
 
+_OVERHEAD = 2**20
+"""Bytes that a checkpoint may take beside its arrays."""
 _MARK = "_CHECKPOINT_METADATA"
 """A file that every finished orbax checkpoint has."""
 
@@ -32,7 +34,8 @@ def save(path: str | Path, tree: Any) -> None:
     parent = os.path.dirname(path)
     os.makedirs(parent, exist_ok=True)
     # Before orbax begins: where it runs out of room it leaves its traces and its complaints.
-    if shutil.disk_usage(parent).free < sum(leaf.nbytes for leaf in jax.tree.leaves(tree)):
+    needed = sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) + _OVERHEAD
+    if shutil.disk_usage(parent).free < needed:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
     context = orbax.Context()
     context.multiprocessing.primary_host = jax.process_index()

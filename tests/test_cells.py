@@ -1,11 +1,13 @@
 import dataclasses
 import itertools
+import signal
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import pytest
 
+from cmedirl_jax import hot_start, training
 from cmedirl_jax.ddpg import DDPGHParams
 from cmedirl_jax.methods import METHODS, Settings
 from cmedirl_jax.networks import Architecture
@@ -15,6 +17,9 @@ from experiments import cells, judging
 from experiments import programs as programs_lib
 from experiments.bookkeeping import Budget
 from experiments.cells import CellResult, Progress
+from experiments.checkpoints import Keeper
+from experiments.interruption import Interrupted, Interruption
+from tests import pools
 
 SEEDS = 3
 STARTS, STARTS_BY_EPISODES = 5, 7
@@ -71,7 +76,14 @@ def programs(env):
     )
 
 
-def train(programs, budget, *, threshold=0.0, before_chunk=lambda state, first_step: state):
+def train(
+    programs,
+    budget,
+    *,
+    threshold=0.0,
+    before_chunk=lambda state, first_step: state,
+    keeper=None,
+):
     chunks, reports, seed_keys = [], [], []
 
     def run(state, groups, data, steps, limit):
@@ -98,6 +110,7 @@ def train(programs, budget, *, threshold=0.0, before_chunk=lambda state, first_s
             budget=budget,
             threshold=threshold,
             report=reports.append,
+            keeper=keeper,
         )
     return Trained(result, chunks, reports)
 
@@ -384,3 +397,96 @@ def test_a_cell_ends_when_every_seed_has_diverged(programs):
     assert trained.result.diverged.all()
     assert [report.env_step for report in trained.reports] == [0, 25]
     assert len(trained.result.evaluations) == 1
+
+
+def keeper(folder, *, stop_after=None):
+    """Saves every chunk; a signal comes during the chunk that follows `stop_after` others."""
+    interruption = Interruption()
+    keeper = Keeper(
+        folder, {}, every=0.0, interruption=interruption, say=lambda line: pytest.fail(line)
+    )
+    visit, visits = keeper.visit, itertools.count()
+
+    def visit_and_count(step, take):
+        if next(visits) == stop_after:
+            interruption.signal = signal.SIGTERM
+        visit(step, take)
+
+    keeper.visit = visit_and_count
+    return keeper
+
+
+def assert_same_results(actual, expected):
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    for x, y in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(x, y)
+        assert np.asarray(x).dtype == np.asarray(y).dtype
+
+
+@pytest.mark.parametrize("chunks", [1, 2, 4])
+@pytest.mark.parametrize("budget", [BY_STEPS, BY_EPISODES], ids=["steps", "episodes"])
+def test_a_cell_that_was_stopped_goes_on_to_the_same_result(
+    programs, by_steps, by_episodes, tmp_path, budget, chunks
+):
+    whole = by_steps if budget is BY_STEPS else by_episodes
+    with pytest.raises(Interrupted, match="SIGTERM"):
+        train(programs, budget, keeper=keeper(tmp_path, stop_after=chunks - 1))
+    rest = train(programs, budget, keeper=keeper(tmp_path))
+    assert_same_results(rest.result, whole.result)
+    assert rest.reports == whole.reports[chunks:]
+    assert [list(chunk.steps) for chunk in rest.chunks] == [
+        list(chunk.steps) for chunk in whole.chunks[chunks:]
+    ]
+
+
+def test_a_cell_that_was_stopped_after_its_last_chunk_takes_no_more_steps(
+    programs, by_steps, tmp_path
+):
+    last = len(by_steps.chunks) - 1
+    with pytest.raises(Interrupted):
+        train(programs, BY_STEPS, keeper=keeper(tmp_path, stop_after=last))
+    rest = train(programs, BY_STEPS, keeper=keeper(tmp_path))
+    assert_same_results(rest.result, by_steps.result)
+    assert not rest.chunks
+
+
+def test_a_cell_goes_on_with_a_seed_that_has_diverged(programs, tmp_path):
+    diverge = diverge_at(25, 1)
+    whole = train(programs, BY_STEPS, before_chunk=diverge)
+    keeping = keeper(tmp_path, stop_after=2)
+    with pytest.raises(Interrupted):
+        train(programs, BY_STEPS, before_chunk=diverge, keeper=keeping)
+    rest = train(programs, BY_STEPS, keeper=keeper(tmp_path))
+    assert_same_results(rest.result, whole.result)
+
+
+def test_a_cell_goes_on_in_other_lanes(programs, by_episodes, tmp_path):
+    with pytest.raises(Interrupted):
+        train(programs, BY_EPISODES, keeper=keeper(tmp_path, stop_after=3))
+    wider = programs._replace(lanes=programs.lanes + 2)
+    rest = train(wider, BY_EPISODES, keeper=keeper(tmp_path)).result
+    np.testing.assert_array_equal(rest.env_steps, by_episodes.result.env_steps)
+    for actual, expected in zip(
+        jax.tree.leaves(rest.final), jax.tree.leaves(by_episodes.result.final), strict=True
+    ):
+        np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_going_on_does_not_compile_again(programs, tmp_path):
+    before = programs.run._cache_size()
+    with pytest.raises(Interrupted):
+        train(programs, BY_STEPS, keeper=keeper(tmp_path, stop_after=0))
+    train(programs, BY_STEPS, keeper=keeper(tmp_path))
+    assert programs.run._cache_size() == before
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_methods_state_can_be_saved(env, name):
+    """Orbax refuses empty arrays."""
+    method = METHODS[name]
+    if method.tabular and not method.interacts:
+        return
+    trainer = training.make(env, method, Settings(), capacity=100, subset_size=2)
+    data = hot_start.data(pools.scripted(2)) if method.uses_demonstrations else None
+    state = jax.eval_shape(lambda: trainer.init(jax.random.key(0), data, 2))
+    assert all(leaf.size for leaf in jax.tree.leaves(state))

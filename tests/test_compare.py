@@ -37,9 +37,9 @@ def cell(method, n_demos, curves, diverged=()):
 
 
 def write_config(folder, **changes):
-    results.open_folder(
-        dataclasses.replace(PRESETS["smoke"], out=folder, seeds=SEEDS, max_steps=200, **changes)
-    )
+    grid = dataclasses.replace(PRESETS["smoke"], out=folder, seeds=SEEDS, max_steps=200, **changes)
+    with results.opened(grid):
+        pass
 
 
 @pytest.fixture

@@ -25,6 +25,12 @@ def contents(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def opened(grid):
+    """Enter the run's folder and leave it; returns the folder."""
+    with results.opened(grid) as folder:
+        return folder
+
+
 def cell(method, n_demos, episodes=3):
     """A finished cell's rows."""
     table = pl.DataFrame({"value": [0.5, 1.5]}).select(
@@ -38,7 +44,8 @@ def test_configuration_is_strict_json_with_versions(tmp_path):
         PRESETS["paper"].settings, reward=IRLHParams(gauge_rate=math.inf)
     )
     grid = dataclasses.replace(PRESETS["paper"], out=tmp_path, settings=settings)
-    text = (results.open_folder(grid) / "config.json").read_text()
+    with results.opened(grid) as folder:
+        text = (folder / "config.json").read_text()
     written = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert written["schema"] == results.SCHEMA
     assert written["versions"]["jax"] == jax.__version__
@@ -50,9 +57,9 @@ def test_configuration_is_strict_json_with_versions(tmp_path):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_same_configuration_enters_again_and_changes_nothing(preset, tmp_path):
     grid = dataclasses.replace(PRESETS[preset], out=tmp_path)
-    results.open_folder(grid)
+    opened(grid)
     before = contents(tmp_path)
-    assert results.open_folder(grid) == tmp_path
+    assert opened(grid) == tmp_path
     assert contents(tmp_path) == before
 
 
@@ -70,10 +77,10 @@ def test_the_same_configuration_enters_again_and_changes_nothing(preset, tmp_pat
     ],
 )
 def test_another_configuration_is_refused_naming_the_option_and_both_values(grid, change, named):
-    folder = results.open_folder(grid)
+    folder = opened(grid)
     before = contents(folder)
     with pytest.raises(UserError) as error:
-        results.open_folder(dataclasses.replace(grid, **change))
+        opened(dataclasses.replace(grid, **change))
     assert str(error.value).startswith("--out: ")
     assert named in str(error.value)
     assert "\n" not in str(error.value)
@@ -81,10 +88,10 @@ def test_another_configuration_is_refused_naming_the_option_and_both_values(grid
 
 
 def test_the_folders_spelling_and_the_devices_are_not_compared(grid, monkeypatch):
-    folder = results.open_folder(grid)
+    folder = opened(grid)
     monkeypatch.chdir(folder.parent)
     respelled = dataclasses.replace(grid, out=Path(folder.name), devices=2)
-    assert results.open_folder(respelled).samefile(folder)
+    assert opened(respelled).samefile(folder)
 
 
 @pytest.mark.parametrize(
@@ -100,10 +107,10 @@ def test_the_folders_spelling_and_the_devices_are_not_compared(grid, monkeypatch
     ],
 )
 def test_a_damaged_or_newer_configuration_is_refused_and_kept(grid, damaged):
-    path = results.open_folder(grid) / "config.json"
+    path = opened(grid) / "config.json"
     path.write_bytes(damaged)
     with pytest.raises(UserError, match=r"^--out: .*config\.json"):
-        results.open_folder(grid)
+        opened(grid)
     assert path.read_bytes() == damaged
 
 
@@ -112,7 +119,7 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path, below):
     file = tmp_path / "file"
     file.write_text("kept")
     with pytest.raises(UserError, match=r"^--out: cannot write to "):
-        results.open_folder(Grid(out=tmp_path / below))
+        opened(Grid(out=tmp_path / below))
     assert contents(tmp_path) == {file: b"kept"}
 
 

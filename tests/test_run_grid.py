@@ -263,6 +263,7 @@ def test_a_run_leaves_what_the_design_lists_and_nothing_unfinished(smoke):
     folder, done = smoke
     assert {path.name for path in folder.iterdir()} == {
         *("config.json", "summary.csv", "demonstrations", "figures", "policies", "rewards"),
+        ".lock",
         *TABLES,
     }
     figures = {path.name: path.stat().st_size for path in (folder / "figures").iterdir()}

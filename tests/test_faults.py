@@ -1,0 +1,253 @@
+"""Runs that are killed, stopped, started twice or out of disk, as real processes."""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+from cmedirl_jax import demonstrations
+from experiments import results
+from tests import compiling, pools
+
+ROOT = Path(__file__).parents[1]
+STEPS = 1500
+RUN = (
+    *("--methods", "hs-me-ddpg", "--n-demos", "1", "2", "--seeds", "4"),
+    *("--max-steps", str(STEPS), "--architecture.hidden", "8", "--hot-start.steps", "20"),
+    *("--devices", "1", "--checkpoint-every", "0"),
+)
+"""Two cells of the same program, six chunks each, every one of which is saved."""
+CONTINUE = "start the same command again to go on\n"
+ISOLATED = ("unshare", "--map-root-user", "--mount")
+LIMIT = 300.0
+"""Seconds after which a process that should have ended is one that hangs."""
+
+
+class Runs:
+    """The same run in any folder, any number of times."""
+
+    def __init__(self, folder, environment):
+        self.folder, self.environment = folder, environment
+        self.demos = folder / "demos.npz"
+        demonstrations.save(self.demos, pools.scripted(3))
+
+    def command(self, out):
+        program = (sys.executable, "-m", "experiments.run_grid")
+        return (*program, *RUN, "--demos", str(self.demos), "--out", str(out))
+
+    def start(self, out, *prefix, **environment):
+        return subprocess.Popen(
+            (*prefix, *self.command(out)),
+            cwd=ROOT,
+            env=self.environment | environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def finish(self, out, **environment):
+        """Run until the end; returns what was printed."""
+        process = self.start(out, **environment)
+        output, errors = process.communicate(timeout=LIMIT)
+        assert process.returncode == 0, errors
+        assert not errors
+        return output
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    return Runs(
+        folder,
+        os.environ
+        | {
+            "JAX_COMPILATION_CACHE_DIR": str(folder / "compiled"),
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {compiling.QUICK_COMMANDS}",
+        },
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(runs):
+    """The folder of a run that nothing befell."""
+    runs.finish(runs.folder / "whole")
+    return runs.folder / "whole"
+
+
+def assert_same_run(folder, whole):
+    for name in results.TABLES:
+        assert_frame_equal(
+            pl.read_parquet(folder / f"{name}.parquet"), pl.read_parquet(whole / f"{name}.parquet")
+        )
+    assert (folder / "summary.csv").read_bytes() == (whole / "summary.csv").read_bytes()
+    left, expected = (
+        {path.relative_to(run) for run in (of,) for path in run.rglob("*") if path.is_file()}
+        for of in (folder, whole)
+    )
+    # Orbax names its data files at random.
+    assert {path for path in left if "d" not in path.parts} == {
+        path for path in expected if "d" not in path.parts
+    }
+
+
+def progress(run):
+    """Steps behind the cells of a run, as far as they are saved."""
+    finished = [path.name for path in run.glob("policies/*[0-9]")]
+    begun = [path for path in run.glob("checkpoints/*/[0-9]*") if path.parent.name not in finished]
+    return STEPS * len(finished) + max((int(path.name) for path in begun), default=0)
+
+
+def wait_for(process, condition):
+    """Wait until `condition` holds or the process has ended."""
+    deadline = time.monotonic() + LIMIT
+    while process.poll() is None and not condition():
+        assert time.monotonic() < deadline, "it hangs"
+        time.sleep(0.0005)
+
+
+def kill(process):
+    """SIGKILL the process; whether it was alive."""
+    process.kill()
+    process.communicate(timeout=LIMIT)
+    return process.returncode == -signal.SIGKILL
+
+
+def test_a_run_that_was_killed_three_times_is_as_one_that_never_was(runs, whole, tmp_path):
+    run = tmp_path / "run"
+    moments = random.Random(0)
+    for number in range(3):
+        process = runs.start(run)
+        steps = moments.randint(1, 2 * STEPS * (number + 1) // 3 - 250)
+        wait_for(process, lambda steps=steps: progress(run) >= steps)
+        time.sleep(moments.uniform(0.0, 0.2))
+        assert kill(process)
+    runs.finish(run)
+    assert_same_run(run, whole)
+
+
+def saving(run):
+    return any(run.glob("checkpoints/*/.partial"))
+
+
+PHASES = {
+    "compiling": lambda run: (run / "config.json").exists(),
+    "training": lambda run: progress(run) >= 500,
+    "saving a checkpoint": saving,
+    "saving a policy": lambda run: any(run.glob("policies/*tmp*")),
+    "writing tables": lambda run: any(run.glob(".*.parquet.partial")),
+    "drawing": lambda run: (run / "figures").exists(),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_run_may_be_killed_in_any_phase(runs, whole, tmp_path, phase):
+    """Four times each, at once or a random while later."""
+    run = tmp_path / "run"
+    moments = random.Random(phase)
+    for _ in range(4):
+        fresh = {}
+        if phase == "compiling":
+            fresh["JAX_COMPILATION_CACHE_DIR"] = str(tmp_path / "empty")
+            shutil.rmtree(tmp_path / "empty", ignore_errors=True)
+        process = runs.start(run, **fresh)
+        wait_for(process, lambda: PHASES[phase](run))
+        time.sleep(moments.uniform(0.0, 5.0 if phase == "compiling" else 0.05))
+        kill(process)
+        if (run / "summary.csv").exists():
+            shutil.rmtree(run)
+    runs.finish(run)
+    assert_same_run(run, whole)
+
+
+def test_a_signal_ends_a_run_with_its_code_and_a_line(runs, whole, tmp_path):
+    run = tmp_path / "run"
+    for number, steps in ((signal.SIGINT, 250), (signal.SIGTERM, STEPS + 250)):
+        process = runs.start(run)
+        wait_for(process, lambda steps=steps: progress(run) >= steps)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=LIMIT)
+        assert errors == f"run_grid: stopped by {number.name}; {CONTINUE}"
+        assert process.returncode == 128 + number
+    assert "goes on from its checkpoint" in runs.finish(run)
+    assert_same_run(run, whole)
+
+
+def test_a_second_process_is_refused_and_a_crash_frees_the_folder(runs, whole, tmp_path):
+    run = tmp_path / "run"
+    first = runs.start(run)
+    wait_for(first, lambda: progress(run) >= 250)
+    first.send_signal(signal.SIGSTOP)
+    try:
+        before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+        second = runs.start(run)
+        _, errors = second.communicate(timeout=LIMIT)
+        assert errors == f"run_grid: --out: another process is at work in {run}\n"
+        assert second.returncode == 2
+        assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+    finally:
+        assert kill(first)
+    runs.finish(run)
+    assert_same_run(run, whole)
+
+
+def can_mount():
+    if shutil.which("unshare") is None:
+        return False
+    mount = (*ISOLATED, "mount", "-t", "tmpfs", "none", "/mnt")
+    return not subprocess.run(mount, capture_output=True, check=False).returncode
+
+
+needs_mount = pytest.mark.skipif(not can_mount(), reason="this user may not mount a file system")
+
+
+@needs_mount
+def test_a_full_disk_ends_a_run_that_goes_on_once_there_is_room(runs, whole, tmp_path):
+    """On a disk that has room for the first cell's checkpoints, not for its results."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    script = """
+        mount -t tmpfs -o size=2m none "$1"
+        head -c "$2" /dev/zero > "$1/filler"
+        shift 2
+        status=0
+        "$@" || status=$?
+        echo "status $status"
+        rm "$DISK/filler"
+        "$@"
+        cp -r "$DISK/run" "$COPY"
+    """
+    filled = runs.start(
+        disk / "run",
+        *(*ISOLATED, "bash", "-euc", script, "-", str(disk), str(2 * 2**20 - 100_000)),
+        DISK=str(disk),
+        COPY=str(tmp_path / "copy"),
+    )
+    output, errors = filled.communicate(timeout=LIMIT)
+    assert filled.returncode == 0, errors
+    assert "status 1" in output.splitlines()
+    (line,) = errors.splitlines(keepends=True)
+    assert line.startswith("run_grid: ")
+    assert "No space left on device" in line
+    assert line.endswith(CONTINUE)
+    assert_same_run(tmp_path / "copy", whole)
+
+
+@needs_mount
+def test_a_read_only_folder_is_refused(runs, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    script = 'mount -t tmpfs -o ro none "$1"; shift; exec "$@"'
+    refused = runs.start(disk / "run", *ISOLATED, "bash", "-euc", script, "-", str(disk))
+    _, errors = refused.communicate(timeout=LIMIT)
+    assert errors == (f"run_grid: --out: cannot write to {disk / 'run'} (Read-only file system)\n")
+    assert refused.returncode == 2

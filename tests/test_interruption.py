@@ -1,0 +1,33 @@
+import os
+import signal
+
+import pytest
+
+from experiments import interruption
+from experiments.interruption import Interrupted
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_is_noted_and_obeyed_later(number, code):
+    before = signal.getsignal(number)
+    with interruption.noted() as noted:
+        noted.obey()
+        os.kill(os.getpid(), number)
+        with pytest.raises(Interrupted, match=number.name) as stopped:
+            noted.obey()
+    assert stopped.value.exit_code == code
+    assert signal.getsignal(number) is before
+
+
+def test_a_second_signal_acts_at_once():
+    with interruption.noted():
+        os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_handlers_are_put_back_after_an_error():
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(ZeroDivisionError), interruption.noted():
+        1 / 0  # noqa: B018
+    assert signal.getsignal(signal.SIGTERM) is before
