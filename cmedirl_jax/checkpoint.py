@@ -46,7 +46,7 @@ def load(path: str | Path, like: Any = None) -> Any:
     held = len(jax.tree.leaves(orbax.metadata(path).metadata))
     if held != len(jax.tree.leaves(like)):
         raise ValueError(f"{path}: holds {held} arrays, not {len(jax.tree.leaves(like))}")
-    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     abstract = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device), like
     )

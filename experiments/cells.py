@@ -14,7 +14,7 @@ from cmedirl_jax.hot_start import HotStartData
 from cmedirl_jax.methods import METHODS, Method, Settings
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.training import Log, TrainingState
-from experiments import judging
+from experiments import distributed, judging
 from experiments.bookkeeping import Book, Budget, EpisodeRows, EvaluationRows
 from experiments.judging import Judge
 from experiments.lanes import Lanes
@@ -182,7 +182,7 @@ def train(
     def of_seeds(tree: Any) -> Any:
         """What lies in lanes, `[lanes, ...]`, as numpy `[seeds, ...]`."""
         index = lanes.of_seed
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
+        return jax.tree.map(lambda leaf: leaf[index], distributed.gather(tree))
 
     def evaluate(starts: int) -> Evaluation:
         found = programs.judge.on_starts(state.agent.actor, starts, groups)
@@ -200,8 +200,9 @@ def train(
         steps = jnp.arange(start, stop, dtype=jnp.int32)
         state, log = programs.run(state, groups, data, steps, limit)
         was_running = book.running.copy()
-        book.mark_diverged(of_seeds(_finite(state)))
-        book.stepped(steps=np.asarray(steps), log=of_seeds(log))
+        finite, log = of_seeds((_finite(state), log))
+        book.mark_diverged(finite)
+        book.stepped(steps=np.asarray(steps), log=log)
         due = np.flatnonzero(book.due_by_episodes() & ~book.diverged)
         if due.size:
             book.evaluated("episodes", due, evaluate(budget.evaluation_starts_episodes))
@@ -223,7 +224,7 @@ def train(
     return CellResult(
         evaluations=book.evaluations,
         episodes=book.episode_rows(),
-        best=jax.tree.map(np.asarray, best),
+        best=distributed.gather(best),
         reward=None if state.reward is None else of_seeds(state.reward.params),
         env_steps=book.env_step,
         demonstration_steps=np.zeros(seeds_count, np.int32)

@@ -18,6 +18,7 @@ from cmedirl_jax.networks import Architecture
 from experiments import (
     cells,
     compilation,
+    distributed,
     experts,
     figures,
     gymnasium_replay,
@@ -48,21 +49,23 @@ class Keys(NamedTuple):
     fresh_starts: jax.Array
 
 
-def run(grid: Grid, devices: list[jax.Device], console: Console) -> pl.DataFrame:
-    """Do what is left of a run; returns its summary.
+def run(grid: Grid, devices: list[jax.Device], console: Console) -> pl.DataFrame | None:
+    """Do what is left of a run; returns its summary, of several processes on process 0 alone.
 
     Raises:
         UserError: for a configuration, a folder or a file that cannot work.
     """
     planning.check(grid)
     env = envs.make(grid.env)
-    given = None if grid.demos is None else planning.load_demonstrations(grid, env)
-    results.check_folder(grid)
+    given = None
+    if grid.demos is not None:
+        given = distributed.pool_from_writer(lambda: planning.load_demonstrations(grid, env))
+    distributed.from_writer(lambda: results.check_folder(grid))
     folder = grid.folder
     keys = Keys(*jax.random.split(jax.random.key(grid.seed), 3))
     plan = planning.cells_of(grid)
-    done = results.finished(folder)
-    todo = [cell for cell in plan if (cell.method.name, cell.n_demos) not in done]
+    done = distributed.from_writer(lambda: [list(cell) for cell in results.finished(folder)])
+    todo = [cell for cell in plan if [cell.method.name, cell.n_demos] not in done]
     if todo:
         kind = devices[0].platform.upper()
         console.print(f"{grid.seeds} seeds per cell on {len(devices)} {kind} device(s)")
@@ -73,6 +76,8 @@ def run(grid: Grid, devices: list[jax.Device], console: Console) -> pl.DataFrame
             f"{cost.misses} did not",
             highlight=False,
         )
+    if not distributed.is_writer():
+        return None
     return _conclude(grid, env, folder, plan, redraw=bool(todo))
 
 
@@ -88,7 +93,9 @@ def _train_cells(
     budget = planning.budget_of(grid, env)
     pool_path = grid.folder / "demonstrations" / "pool.npz"
     needs_pool = any(cell.n_demos for cell in todo)
-    pool = given if given is not None else _reusable(pool_path, env)
+    pool = given
+    if pool is None:
+        pool = distributed.pool_from_writer(lambda: _reusable(pool_path, env))
     trains_experts = needs_pool and pool is None
     expert_steps = grid.experts.seeds * grid.experts.steps
     learners = grid.seeds * sum(cell.method.interacts for cell in todo)
@@ -118,10 +125,7 @@ def _train_cells(
             data = hot_start.data(pool, agent.discount, agent.reward_scale)
             metadata = pool.metadata
         # Only now: a refusal, or a run stopped among the experts, leaves nothing behind.
-        folder = results.open_folder(grid)
-        if pool is not None and not pool_path.exists():
-            pool_path.parent.mkdir(exist_ok=True)
-            demonstrations.save(pool_path, pool)
+        distributed.from_writer(lambda: _open_folder(grid, pool, pool_path))
         for cell in todo:
             report.start(f"{cell.name}, {grid.seeds} seeds")
             if cell.method.tabular is None or cell.method.interacts:
@@ -161,10 +165,13 @@ def _train_cells(
                 replay=gymnasium_replay.replay(programs.judge, result.best, env),
                 expert_steps=metadata.get("expert_env_steps", 0) if cell.n_demos else 0,
             )
-            checkpoint.save(folder / "policies" / cell.name, result.best)
+            if not distributed.is_writer():
+                continue
+            save = functools.partial(distributed.alone, checkpoint.save)
+            save(grid.folder / "policies" / cell.name, result.best)
             if result.reward is not None:
-                checkpoint.save(folder / "rewards" / cell.name, result.reward)
-            results.append(folder, rows)
+                save(grid.folder / "rewards" / cell.name, result.reward)
+            results.append(grid.folder, rows)
 
 
 def _compiler(
@@ -203,6 +210,13 @@ def _compiler(
         )
 
     return compile_method
+
+
+def _open_folder(grid: Grid, pool: Demonstrations | None, pool_path: Path) -> None:
+    results.open_folder(grid)
+    if pool is not None and not pool_path.exists():
+        pool_path.parent.mkdir(exist_ok=True)
+        demonstrations.save(pool_path, pool)
 
 
 def _reusable(path: Path, env: Env) -> Demonstrations | None:

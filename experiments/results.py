@@ -26,7 +26,7 @@ PACKAGES = ("jax", "jaxlib", "flax", "optax", "chex", "gymnasium", "numpy", "orb
 TABLES = ("seeds", "episodes", "evaluations")
 """In the order they are written."""
 
-_NOT_COMPARED = ("out", "devices")
+_NOT_COMPARED = ("out", "devices", "distributed", "coordinator", "processes", "process_id")
 
 
 def describe(grid: Grid) -> dict[str, Any]:

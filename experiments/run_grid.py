@@ -14,7 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from experiments import compilation, planning
+from experiments import compilation, distributed, planning
 from experiments import grid as grid_lib
 from experiments.errors import UserError
 from experiments.presets import PRESETS, Grid
@@ -22,7 +22,22 @@ from experiments.presets import PRESETS, Grid
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    grid = parse(sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    grid = parse(arguments)
+    try:
+        distributed.check(grid)
+    except UserError as error:
+        print(f"run_grid: {error}", file=sys.stderr)
+        return 2
+    if not distributed.is_asked(grid):
+        return work(grid)
+    if not distributed.is_worker():
+        return distributed.supervise(arguments)
+    return distributed.guarded(lambda: work(grid))
+
+
+def work(grid: Grid) -> int:
+    """Do the run, or this process's share of it; returns the exit code."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=120)
@@ -30,11 +45,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         # Before anything else: the first array that JAX makes fixes the number of CPU devices.
         devices = start_devices(grid)
+        console.quiet = not distributed.is_writer()
         planning.check(grid)
         summary = grid_lib.run(grid, devices, console)
     except UserError as error:
         print(f"run_grid: {error}", file=sys.stderr)
         return 2
+    if summary is None:
+        return 0
     console.print(summary_table(summary))
     difference = summary["gymnasium_difference_max"].max()
     console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
@@ -71,10 +89,14 @@ def start_devices(grid: Grid) -> list[jax.Device]:
         # Once JAX has started (a second call in one process) it keeps the devices it has.
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", wanted)
-    devices = jax.devices()
+    if distributed.is_asked(grid):
+        distributed.join(grid)
+    devices = jax.local_devices()
     available = len(devices) if devices[0].platform != "cpu" else cores()
     if grid.devices is not None and grid.devices > available:
         raise UserError(f"--devices: {grid.devices} asked, there are {available}")
+    if distributed.is_asked(grid):
+        return distributed.devices(grid.devices, grid.seeds)
     return devices[: max(grid.devices, 1)] if grid.devices is not None else devices
 
 

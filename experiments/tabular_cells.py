@@ -14,7 +14,7 @@ from cmedirl_jax.hot_start import HotStartData
 from cmedirl_jax.methods import Method, Settings
 from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.discretise import FiniteMDP
-from experiments import judging
+from experiments import distributed, judging
 from experiments.bookkeeping import EpisodeRows, EvaluationRows, Means
 from experiments.cells import CellResult
 from experiments.judging import Judge
@@ -104,8 +104,8 @@ def train(
     """Fit every seed and evaluate its greedy policy, and as protocol "soft" its soft one, once."""
     keys = seeds.keys(key, seeds.padded(seeds_count, 1, programs.devices))
     fitted = jax.tree.map(
-        lambda leaf: np.asarray(leaf)[:seeds_count],
-        programs.fit(keys, programs.mdp, data, n_demos),
+        lambda leaf: leaf[:seeds_count],
+        distributed.gather(programs.fit(keys, programs.mdp, data, n_demos)),
     )
     table = fitted.log_probabilities
     every = np.arange(seeds_count)
