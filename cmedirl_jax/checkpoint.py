@@ -18,11 +18,11 @@ _MARK = "_CHECKPOINT_METADATA"
 def save(path: str | Path, tree: Any) -> None:
     """Write a pytree of arrays to the folder `path`; a whole one or none.
 
-    Under `jax.distributed` the calling process writes by itself, whatever the others do.
+    Under `jax.distributed`, orbax's way: every process calls it, and all wait for each other.
 
     Args:
         path: the folder; a checkpoint that is there is replaced.
-        tree: arrays that are wholly in this process, none of them empty.
+        tree: arrays, none of them empty.
 
     Raises:
         FileExistsError: if there is something at `path` that is not a checkpoint, to be replaced.
@@ -37,12 +37,8 @@ def save(path: str | Path, tree: Any) -> None:
     needed = sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) + _OVERHEAD
     if shutil.disk_usage(parent).free < needed:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
-    context = orbax.Context()
-    context.multiprocessing.primary_host = jax.process_index()
-    context.multiprocessing.active_processes = {jax.process_index()}
     try:
-        with context:
-            orbax.save(path, tree, overwrite=True)
+        orbax.save(path, tree, overwrite=True)
     except ValueError as error:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
@@ -71,7 +67,7 @@ def load(path: str | Path, like: Any = None) -> Any:
     held = len(jax.tree.leaves(orbax.metadata(path).metadata))
     if held != len(jax.tree.leaves(like)):
         raise ValueError(f"{path}: holds {held} arrays, not {len(jax.tree.leaves(like))}")
-    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     abstract = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device), like
     )

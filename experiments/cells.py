@@ -11,7 +11,7 @@ import numpy as np
 from cmedirl_jax.evaluation import Evaluation
 from cmedirl_jax.hot_start import HotStartData
 from cmedirl_jax.training import TrainingState
-from experiments import judging
+from experiments import distributed, judging
 from experiments.bookkeeping import Book, Budget, EpisodeRows, EvaluationRows
 from experiments.checkpoints import Keeper, Snapshot
 from experiments.lanes import Lanes
@@ -156,8 +156,7 @@ class _Training:
         else:
             lane = np.argsort(lane_seed)[np.minimum(lanes.seed, lanes.seeds - 1)]
             state = jax.tree.map(lambda leaf: leaf[lane], state)
-        state = jax.tree.map(_typed, abstract, state)
-        state = jax.device_put(state, programs.sharding)
+        state = jax.tree.map(_typed, abstract, jax.device_put(state, programs.sharding))
         training = cls(programs, data, Book.of_record(saved.record, budget), lanes, state)
         training.step = saved.step
         training.best, training.best_return = saved.state["best"], saved.state["best_return"]
@@ -189,7 +188,7 @@ class _Training:
             "best_return": self.best_return,
         }
         record = {"lane_seed": self.lanes.seed, **self.book.record()}
-        return jax.tree.map(np.array, tree), record
+        return jax.tree.map(np.array, distributed.gather(tree)), record
 
     def advance(self, stop: int) -> None:
         """Take the steps up to `stop`, and evaluate the seeds that are due."""
@@ -201,8 +200,9 @@ class _Training:
         self.state, log = self.programs.run(self.state, groups, self.data, steps, limit)
         self.step = stop
         was_running = book.running.copy()
-        book.mark_diverged(self._of_seeds(_finite(self.state)))
-        book.stepped(steps=np.asarray(steps), log=self._of_seeds(log))
+        finite, log = self._of_seeds((_finite(self.state), log))
+        book.mark_diverged(finite)
+        book.stepped(steps=np.asarray(steps), log=log)
         due = np.flatnonzero(book.due_by_episodes() & ~book.diverged)
         if due.size:
             found = self._evaluate(budget.evaluation_starts_episodes, groups)
@@ -224,7 +224,7 @@ class _Training:
         return CellResult(
             evaluations=book.evaluations,
             episodes=book.episode_rows(),
-            best=jax.tree.map(np.asarray, self.best),
+            best=distributed.gather(self.best),
             reward=None if state.reward is None else self._of_seeds(state.reward.params),
             env_steps=book.env_step,
             demonstration_steps=np.zeros(self.lanes.seeds, np.int32)
@@ -237,7 +237,7 @@ class _Training:
     def _of_seeds(self, tree: Any) -> Any:
         """What lies in lanes, `[lanes, ...]`, as numpy `[seeds, ...]`."""
         index = self.lanes.of_seed
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[index], tree)
+        return jax.tree.map(lambda leaf: leaf[index], distributed.gather(tree))
 
     def _evaluate(self, starts: int, groups: int) -> Evaluation:
         found = self.programs.judge.on_starts(self.state.agent.actor, starts, groups)
@@ -257,7 +257,7 @@ def _untyped(leaf: jax.Array) -> jax.Array:
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
-def _typed(like: jax.ShapeDtypeStruct, array: np.ndarray) -> Any:
+def _typed(like: jax.ShapeDtypeStruct, array: jax.Array) -> jax.Array:
     return jax.random.wrap_key_data(array) if _is_key(like) else array
 
 

@@ -23,6 +23,7 @@ import jax
 import numpy as np
 
 from cmedirl_jax import checkpoint
+from experiments import distributed
 from experiments.errors import UserError
 from experiments.interruption import Interruption
 
@@ -86,15 +87,32 @@ class Keeper:
         Raises:
             UserError: if one was written by a version with another schema.
         """
+        held: list[Snapshot] = []
+
+        def read() -> dict[str, Any] | None:
+            found = self._newest(like)
+            if found is None:
+                return None
+            held.append(found)
+            return {"step": found.step, "names": list(found.record)}
+
+        found = distributed.from_writer(read)
+        if found is None:
+            return None
+        self._saved, names = found["step"], found["names"]
+        mine = [*held[0].record.values(), *jax.tree.leaves(held[0].state)] if held else None
+        arrays = distributed.arrays_from_writer(mine)
+        record = dict(zip(names, arrays, strict=False))
+        state = jax.tree.unflatten(jax.tree.structure(like(record)), arrays[len(names) :])
+        return Snapshot(found["step"], state, record)
+
+    def _newest(self, like: Callable[[dict[str, np.ndarray]], Any]) -> Snapshot | None:
         for path in _newest_first(self.folder):
             try:
-                found = _read(path, self.identity, like)
+                return _read(path, self.identity, like)
             except _Unusable as reason:
                 self._say(f"{path} {reason}: going back to the one before, if there is one")
                 shutil.rmtree(path)
-                continue
-            self._saved = found.step
-            return found
         return None
 
     def visit(self, step: int, take: Callable[[], tuple[Any, dict[str, np.ndarray]]]) -> None:
@@ -107,17 +125,19 @@ class Keeper:
         Raises:
             Interrupted: if a signal came, after saving.
         """
-        if self._interruption.signal is None and time.monotonic() < self._due:
+        stops = self._interruption.came()
+        if not stops and not distributed.any_process(time.monotonic() >= self._due):
             return
         self.wait()
         if self._saved != step:
             snapshot = Snapshot(step, *take())
-            self._pending = self._saving.submit(_write, self.folder, self.identity, snapshot)
+            if distributed.is_writer():
+                self._pending = self._saving.submit(_write, self.folder, self.identity, snapshot)
             self._saved = step
         self._due = time.monotonic() + self.every
-        if self._interruption.signal is not None:
+        if stops:
             self.wait()
-            self._interruption.obey()
+            self._interruption.stop()
 
     def wait(self) -> None:
         """Wait until the last checkpoint is on disk."""
@@ -152,7 +172,7 @@ def _write(folder: Path, identity: dict[str, Any], snapshot: Snapshot) -> None:
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
-        checkpoint.save(partial / "state", snapshot.state)
+        distributed.alone(checkpoint.save, partial / "state", snapshot.state)
         with (partial / "record.npz").open("wb") as file:
             np.savez(file, allow_pickle=False, **snapshot.record)
         manifest = {"schema": SCHEMA, "identity": identity, "files": _digests(partial)}
@@ -197,7 +217,7 @@ def _read(
     with np.load(path / "record.npz", allow_pickle=False) as archive:
         record = dict(archive)
     try:
-        state = checkpoint.load(path / "state", like(record))
+        state = distributed.alone(checkpoint.load, path / "state", like(record))
     except ValueError as error:
         raise _Unusable("holds another structure") from error
     return Snapshot(int(path.name), jax.tree.map(np.asarray, state), record)

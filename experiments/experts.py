@@ -11,7 +11,7 @@ from cmedirl_jax import demonstrations
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.types import Transition
-from experiments import cells
+from experiments import cells, distributed
 from experiments.bookkeeping import Budget
 from experiments.cells import Progress
 from experiments.checkpoints import Keeper
@@ -78,8 +78,6 @@ def make_pool(
     def record_all(actor: Any, key: jax.Array) -> tuple[Transition, jax.Array, jax.Array]:
         return record(programs.judge.act, env, actor, key, per_expert)
 
-    recorded = record_all(actors, jax.random.split(start_key, chosen.size))
-    transition, running, truncated = jax.tree.map(np.asarray, recorded)
     metadata = {
         "env": env.spec.id,
         "source": "noise-free trajectories of DDPG experts trained on the true reward",
@@ -89,7 +87,15 @@ def make_pool(
         "experts_demonstrating": chosen.tolist(),
         "expert_env_steps": int(result.env_steps.sum()),
     }
-    return flatten(transition, running, truncated, metadata)
+
+    def recorded() -> Demonstrations:
+        columns = record_all(actors, jax.random.split(start_key, chosen.size))
+        return flatten(*jax.tree.map(np.asarray, columns), metadata)
+
+    # Once for all processes: another kind of machine might round to episodes of other lengths.
+    pool = distributed.pool_from_writer(recorded)
+    assert pool is not None
+    return pool
 
 
 def choose(returns: np.ndarray, which: Expert, threshold: float) -> np.ndarray:

@@ -1,5 +1,6 @@
 """A whole run: demonstrations, then cell after cell, then the summary and the figures."""
 
+import contextlib
 import dataclasses
 import functools
 import shutil
@@ -19,6 +20,7 @@ from cmedirl_jax.networks import Architecture
 from experiments import (
     cells,
     compilation,
+    distributed,
     experts,
     figures,
     gymnasium_replay,
@@ -58,7 +60,6 @@ class _Session(NamedTuple):
     grid: Grid
     env: Env
     keys: Keys
-    folder: Path
     devices: list[jax.Device]
     console: Console
     interruption: Interruption
@@ -66,18 +67,22 @@ class _Session(NamedTuple):
     def keeper(self, name: str) -> Keeper:
         """What saves the training that is called `name`."""
         return Keeper(
-            self.folder / "checkpoints" / name,
+            self.grid.folder / "checkpoints" / name,
             results.identity(self.grid),
             every=self.grid.checkpoint_every,
             interruption=self.interruption,
-            say=lambda line: self.console.print(line, highlight=False, soft_wrap=True),
+            say=self.say,
         )
+
+    def say(self, line: str) -> None:
+        """Tell the user."""
+        self.console.print(line, highlight=False, soft_wrap=True)
 
 
 def run(
     grid: Grid, devices: list[jax.Device], console: Console, interruption: Interruption
-) -> pl.DataFrame:
-    """Do what is left of a run; returns its summary.
+) -> pl.DataFrame | None:
+    """Do what is left of a run; returns its summary, of several processes on process 0 alone.
 
     Raises:
         UserError: for a configuration, a folder or a file that cannot work.
@@ -86,18 +91,24 @@ def run(
     """
     planning.check(grid)
     env = envs.make(grid.env)
-    given = None if grid.demos is None else planning.load_demonstrations(grid, env)
+    given = None
+    if grid.demos is not None:
+        given = distributed.pool_from_writer(lambda: planning.load_demonstrations(grid, env))
     keys = Keys(*jax.random.split(jax.random.key(grid.seed), 3))
     plan = planning.cells_of(grid)
-    with results.opened(grid) as folder:
-        done = results.finished(folder)
-        todo = [cell for cell in plan if (cell.method.name, cell.n_demos) not in done]
-        session = _Session(grid, env, keys, folder, devices, console, interruption)
+    folder = grid.folder
+    with contextlib.ExitStack() as stack:
+        distributed.from_writer(lambda: str(stack.enter_context(results.opened(grid))))
+        done = distributed.from_writer(lambda: [list(cell) for cell in results.finished(folder)])
+        todo = [cell for cell in plan if [cell.method.name, cell.n_demos] not in done]
         if todo:
+            session = _Session(grid, env, keys, devices, console, interruption)
             kind = devices[0].platform.upper()
             console.print(f"{grid.seeds} seeds per cell on {len(devices)} {kind} device(s)")
-            for name, version in results.other_versions(folder).items():
-                console.print(f"This run was begun with {name} {version}", highlight=False)
+            for name, version in distributed.from_writer(
+                lambda: results.other_versions(folder)
+            ).items():
+                session.say(f"This run was begun with {name} {version}")
             with compilation.counted() as cost:
                 _train_cells(session, given, todo)
             console.print(
@@ -105,16 +116,20 @@ def run(
                 f"{cost.misses} did not",
                 highlight=False,
             )
+        if not distributed.is_writer():
+            return None
         shutil.rmtree(folder / "checkpoints", ignore_errors=True)
         return _conclude(grid, env, folder, plan, redraw=bool(todo))
 
 
 def _train_cells(session: _Session, given: Demonstrations | None, todo: list[Cell]) -> None:
-    grid, env, keys, folder, devices, console, interruption = session
+    grid, env, keys, devices, console, interruption = session
     budget = planning.budget_of(grid, env)
-    pool_path = folder / "demonstrations" / "pool.npz"
+    pool_path = grid.folder / "demonstrations" / "pool.npz"
     needs_pool = any(cell.n_demos for cell in todo)
-    pool = given if given is not None else _reusable(pool_path, env)
+    pool = given
+    if pool is None:
+        pool = distributed.pool_from_writer(lambda: _reusable(pool_path, env))
     trains_experts = needs_pool and pool is None
     expert_steps = grid.experts.seeds * grid.experts.steps
     learners = grid.seeds * sum(cell.method.interacts for cell in todo)
@@ -147,11 +162,12 @@ def _train_cells(session: _Session, given: Demonstrations | None, todo: list[Cel
             agent = grid.settings.agent
             data = hot_start.data(pool, agent.discount, agent.reward_scale)
             metadata = pool.metadata
-        if pool is not None and not pool_path.exists():
+        if pool is not None and distributed.is_writer() and not pool_path.exists():
             pool_path.parent.mkdir(exist_ok=True)
             demonstrations.save(pool_path, pool)
         for cell in todo:
-            interruption.obey()
+            if interruption.came():
+                interruption.stop()
             report.start(f"{cell.name}, {grid.seeds} seeds")
             keeper = session.keeper(cell.name)
             if cell.method.tabular is None or cell.method.interacts:
@@ -193,11 +209,14 @@ def _train_cells(session: _Session, given: Demonstrations | None, todo: list[Cel
                 replay=gymnasium_replay.replay(programs.judge, result.best, env),
                 expert_steps=metadata.get("expert_env_steps", 0) if cell.n_demos else 0,
             )
+            if not distributed.is_writer():
+                continue
             keeper.wait()
-            checkpoint.save(folder / "policies" / cell.name, result.best)
+            save = functools.partial(distributed.alone, checkpoint.save)
+            save(grid.folder / "policies" / cell.name, result.best)
             if result.reward is not None:
-                checkpoint.save(folder / "rewards" / cell.name, result.reward)
-            results.append(folder, rows)
+                save(grid.folder / "rewards" / cell.name, result.reward)
+            results.append(grid.folder, rows)
             keeper.remove()
 
 

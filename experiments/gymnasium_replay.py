@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax.envs import Env
+from experiments import distributed
 from experiments.judging import Judge
 
 STARTS = 3
@@ -24,7 +25,7 @@ class Replay(NamedTuple):
 
 def replay(judge: Judge, actors: Any, env: Env) -> Replay:
     """Run each seed's policy `[seeds, ...]` from the same starts in both environments."""
-    jax_return = np.asarray(judge.on_starts(actors, STARTS).episode_return)
+    jax_return = distributed.gather(judge.on_starts(actors, STARTS).episode_return)
     act = jax.jit(jax.vmap(judge.act))
     return Replay(_run(lambda observations: act(actors, observations), actors, env), jax_return)
 

@@ -4,6 +4,9 @@ import contextlib
 import signal
 from collections.abc import Iterator
 from types import FrameType
+from typing import NoReturn
+
+from experiments import distributed
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -21,19 +24,22 @@ class Interrupted(Exception):
 
 
 class Interruption:
-    """Which signal has asked the run to stop, if any."""
+    """Which signal has asked this process to stop, if any."""
 
     def __init__(self):
         self.signal: int | None = None
 
-    def obey(self) -> None:
-        """Stop here if a signal has asked for it.
+    def came(self) -> bool:
+        """Whether a signal has asked any process of the run to stop: a collective of them all."""
+        return distributed.any_process(self.signal is not None)
+
+    def stop(self) -> NoReturn:
+        """Stop here.
 
         Raises:
-            Interrupted: then.
+            Interrupted: by this process's signal; SIGTERM, if it was another's.
         """
-        if self.signal is not None:
-            raise Interrupted(self.signal)
+        raise Interrupted(signal.SIGTERM if self.signal is None else self.signal)
 
 
 @contextlib.contextmanager

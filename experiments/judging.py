@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from cmedirl_jax import evaluation, networks, seeds
 from cmedirl_jax.envs import Env
 from cmedirl_jax.evaluation import Evaluation, Rollouts
 from cmedirl_jax.networks import Architecture
+from experiments import distributed
 
 
 class Judge(NamedTuple):
@@ -75,7 +75,7 @@ def make(
 
 def summarise(rollouts: Rollouts) -> Evaluation:
     """Each seed's statistics over its starts, `[seeds]`, on the host."""
-    return jax.tree.map(np.asarray, _summarise(rollouts))
+    return distributed.gather(_summarise(rollouts))
 
 
 _summarise = jax.jit(jax.vmap(evaluation.summarise))

@@ -63,9 +63,18 @@ class Grid:
     env: str = "MountainCarContinuous-v0"
     """The environment, by Gymnasium's name."""
     devices: int | None = None
-    """CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU."""
+    """CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU. With
+    several processes, of each of them."""
     group: int | None = None
     """Seeds that a device steps together; default: what is fastest for the networks' width."""
+    distributed: bool = False
+    """Share the run with the other processes of the cluster that JAX detects (docs/scaling.md)."""
+    coordinator: str | None = None
+    """Share the run with other processes: HOST:PORT of process 0, the same for all of them."""
+    processes: int | None = None
+    """With coordinator: how many processes there are."""
+    process_id: int | None = None
+    """With coordinator: which of them this is, from 0; process 0 alone writes results."""
     checkpoint_every: float = 60.0
     """Seconds from one checkpoint of the training to the next; 0: one after every chunk."""
     experts: ExpertSettings = ExpertSettings()

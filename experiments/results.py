@@ -33,7 +33,10 @@ TABLES = ("seeds", "episodes", "evaluations")
 """In the order they are written."""
 
 _LOCK = ".lock"
-_NOT_COMPARED = ("out", "devices", "checkpoint_every")
+_NOT_COMPARED = (
+    *("out", "devices", "distributed", "coordinator", "processes", "process_id"),
+    "checkpoint_every",
+)
 
 
 def describe(grid: Grid) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from experiments import compilation, interruption, planning
+from experiments import compilation, distributed, interruption, planning
 from experiments import grid as grid_lib
 from experiments.errors import UserError
 from experiments.interruption import Interrupted
@@ -25,7 +25,21 @@ _CONTINUE = "start the same command again to go on"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    grid = parse(sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    grid = parse(arguments)
+    try:
+        distributed.check(grid)
+    except UserError as error:
+        return _end(2, str(error))
+    if not distributed.is_asked(grid):
+        return work(grid)
+    if not distributed.is_worker():
+        return distributed.supervise(arguments)
+    return distributed.guarded(lambda: work(grid))
+
+
+def work(grid: Grid) -> int:
+    """Do the run, or this process's share of it; returns the exit code."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=120)
@@ -33,6 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         # Before anything else: the first array that JAX makes fixes the number of CPU devices.
         devices = start_devices(grid)
+        console.quiet = not distributed.is_writer()
         planning.check(grid)
         with interruption.noted() as signals:
             summary = grid_lib.run(grid, devices, console, signals)
@@ -44,6 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _end(130, f"stopped at once; {_CONTINUE}")
     except OSError as error:
         return _end(1, f"{error}; what is finished is kept: {_CONTINUE}")
+    if summary is None:
+        return 0
     console.print(summary_table(summary))
     difference = summary["gymnasium_difference_max"].max()
     console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
@@ -85,10 +102,14 @@ def start_devices(grid: Grid) -> list[jax.Device]:
         # Once JAX has started (a second call in one process) it keeps the devices it has.
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", wanted)
-    devices = jax.devices()
+    if distributed.is_asked(grid):
+        distributed.join(grid)
+    devices = jax.local_devices()
     available = len(devices) if devices[0].platform != "cpu" else cores()
     if grid.devices is not None and grid.devices > available:
         raise UserError(f"--devices: {grid.devices} asked, there are {available}")
+    if distributed.is_asked(grid):
+        return distributed.devices(grid.devices, grid.seeds)
     return devices[: max(grid.devices, 1)] if grid.devices is not None else devices
 
 

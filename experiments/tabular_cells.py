@@ -14,7 +14,7 @@ from cmedirl_jax.hot_start import HotStartData
 from cmedirl_jax.methods import Method, Settings
 from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.discretise import FiniteMDP
-from experiments import judging
+from experiments import distributed, judging
 from experiments.bookkeeping import EpisodeRows, EvaluationRows, Means
 from experiments.cells import CellResult
 from experiments.checkpoints import Keeper
@@ -140,7 +140,7 @@ def train(
         fitted = saved.step
         parts.append(saved.state)
     for first in range(fitted, seeds_count, programs.devices):
-        parts.append(jax.tree.map(np.asarray, fit(keys[first : first + programs.devices])))
+        parts.append(distributed.gather(fit(keys[first : first + programs.devices])))
         if keeper is not None:
             keeper.visit(first + programs.devices, take)
     found = jax.tree.map(lambda leaf: leaf[:seeds_count], _joined(parts))

@@ -11,10 +11,11 @@ from experiments.interruption import Interrupted
 def test_a_signal_is_noted_and_obeyed_later(number, code):
     before = signal.getsignal(number)
     with interruption.noted() as noted:
-        noted.obey()
+        assert not noted.came()
         os.kill(os.getpid(), number)
+        assert noted.came()
         with pytest.raises(Interrupted, match=number.name) as stopped:
-            noted.obey()
+            noted.stop()
     assert stopped.value.exit_code == code
     assert signal.getsignal(number) is before
 

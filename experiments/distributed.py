@@ -1,0 +1,303 @@
+"""One run on several processes, under JAX's own multi-process runtime; docs/scaling.md.
+
+Every process runs the same program on the same values: whatever the host decides from comes from
+`gather`, or from process 0 by `from_writer`. Process 0 alone prints, and touches the run's folder.
+"""
+
+import atexit
+import concurrent.futures
+import functools
+import io
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from cmedirl_jax.demonstrations import Demonstrations
+from cmedirl_jax.types import Transition
+from experiments.errors import UserError
+from experiments.presets import Grid
+
+HEARTBEAT_TIMEOUT = 20
+"""Seconds after which a process that has fallen silent counts as dead."""
+GONE = (
+    "run_grid: another process is gone, or never came; "
+    "start the same command on all machines again to continue"
+)
+_WORKER = "CMEDIRL_JAX_DISTRIBUTED_WORKER"
+_BLOCK = 4096
+"""Bytes are sent in whole blocks, so that few sizes are compiled."""
+
+
+def check(grid: Grid) -> None:
+    """Refuse options that contradict each other.
+
+    Raises:
+        UserError: naming the option, what is wrong and what would be right.
+    """
+    if grid.coordinator is None:
+        for name in ("processes", "process_id"):
+            if getattr(grid, name) is not None:
+                raise UserError(f"--{name.replace('_', '-')}: needs --coordinator HOST:PORT")
+        return
+    host, _, port = grid.coordinator.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
+        raise UserError(f"--coordinator: must be HOST:PORT, got {grid.coordinator}")
+    if grid.processes is None or grid.process_id is None:
+        raise UserError("--coordinator: needs --processes N and --process-id I too")
+    if grid.processes < 1:
+        raise UserError(f"--processes: must be at least 1, got {grid.processes}")
+    if not 0 <= grid.process_id < grid.processes:
+        last = grid.processes - 1
+        raise UserError(f"--process-id: must be between 0 and {last}, got {grid.process_id}")
+
+
+def is_asked(grid: Grid) -> bool:
+    """Whether the run has several processes, of which this is one."""
+    return grid.distributed or grid.coordinator is not None
+
+
+def supervise(arguments: Sequence[str]) -> int:
+    """Run this process's share in a child; returns the command's exit code.
+
+    JAX's runtime aborts a process that loses the coordinator, before Python can say a word; so
+    somebody else must. The child ends when this process does.
+    """
+    child = subprocess.Popen(
+        [sys.executable, "-m", "experiments.run_grid", *arguments],
+        env=os.environ | {_WORKER: "1"},
+        stdin=subprocess.PIPE,
+        start_new_session=True,
+    )
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: child.send_signal(number))
+    code = child.wait()
+    if code == -signal.SIGABRT:
+        print(GONE, file=sys.stderr)
+    elif code < 0:
+        print(f"run_grid: ended by signal {-code}", file=sys.stderr)
+    return 1 if code < 0 else code
+
+
+def is_worker() -> bool:
+    """Whether this process is a child of `supervise`."""
+    return _WORKER in os.environ
+
+
+def join(grid: Grid) -> None:
+    """Meet the other processes; before any other use of JAX.
+
+    Raises:
+        UserError: if JAX's cluster detection finds no cluster.
+    """
+    _end_after(lambda: os.read(sys.stdin.fileno(), 1))
+    # It would take SIGTERM for itself.
+    jax.config.update("jax_enable_preemption_service", False)
+    try:
+        jax.distributed.initialize(
+            grid.coordinator,
+            grid.processes,
+            grid.process_id,
+            # With all four given, JAX looks for no cluster.
+            cluster_detection_method=None if grid.coordinator is None else "deactivate",
+            heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT,
+        )
+    except ValueError as error:
+        raise UserError(
+            f"--distributed: JAX detects no cluster here ({error}); "
+            "give --coordinator HOST:PORT --processes N --process-id I"
+        ) from error
+
+
+def guarded(run: Callable[[], int]) -> int:
+    """Run a worker's share; on any failure end at once, so that the others learn of it."""
+    try:
+        return run()
+    except Exception as error:
+        # An ordinary exit would wait for processes that wait for this one.
+        if isinstance(error, jax.errors.JaxRuntimeError) and "Gloo" in str(error):
+            print(GONE, file=sys.stderr, flush=True)
+        else:
+            traceback.print_exc()
+        sys.stdout.flush()
+        os._exit(1)
+
+
+def is_writer() -> bool:
+    """Whether this process prints and writes."""
+    return jax.process_index() == 0
+
+
+def devices(count: int | None, seeds: int) -> list[jax.Device]:
+    """The devices of all processes, those of one process side by side.
+
+    Args:
+        count: devices of each process, or None for all that get four seeds or more.
+        seeds: that share them.
+    """
+    if count is None:
+        count = max(1, seeds // (4 * jax.process_count()))
+    return [
+        device for process in range(jax.process_count()) for device in _of_process(process)[:count]
+    ]
+
+
+def _of_process(process: int) -> list[jax.Device]:
+    found = [device for device in jax.devices() if device.process_index == process]
+    return sorted(found, key=lambda device: device.id)
+
+
+def gather(tree: Any) -> Any:
+    """Arrays that lie on the devices of all processes, whole as numpy on each process.
+
+    A collective, unless everything lies on this process's devices.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    spread = {
+        index: leaf
+        for index, leaf in enumerate(leaves)
+        if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable
+    }
+    for leaf in spread.values():
+        whole = _replicate(leaf.sharding.mesh)(spread)
+        leaves = [whole.get(index, leaf) for index, leaf in enumerate(leaves)]
+        break
+    return jax.tree.unflatten(structure, [np.asarray(leaf) for leaf in leaves])
+
+
+@functools.cache
+def _replicate(mesh: jax.sharding.Mesh) -> Callable[[Any], Any]:
+    return jax.jit(lambda tree: tree, out_shardings=jax.sharding.NamedSharding(mesh, jax.P()))
+
+
+def any_process(flag: bool) -> bool:
+    """Whether `flag` is set on any process. A collective, if there are several."""
+    return flag if jax.process_count() == 1 else bool(_total(np.int32([flag])).any())
+
+
+def from_writer(read: Callable[[], Any]) -> Any:
+    """What `read` gives on process 0, a JSON value, on every process.
+
+    A collective, if there are several.
+
+    Raises:
+        UserError: on every process, if `read` raised it.
+    """
+    if jax.process_count() == 1:
+        return read()
+    message, error = {}, None
+    if is_writer():
+        try:
+            message = {"value": read()}
+        except UserError as raised:
+            message, error = {"error": str(raised)}, raised
+    message = json.loads(_from_writer(json.dumps(message).encode()))
+    if "error" in message:
+        raise UserError(message["error"]) from error
+    return message["value"]
+
+
+def arrays_from_writer(arrays: Sequence[np.ndarray] | None) -> list[np.ndarray]:
+    """Process 0's numpy arrays, on every process; the others' argument is ignored. A collective."""
+    if jax.process_count() == 1:
+        assert arrays is not None
+        return list(arrays)
+    buffer = io.BytesIO()
+    if is_writer():
+        assert arrays is not None
+        np.savez(buffer, allow_pickle=False, **{str(i): array for i, array in enumerate(arrays)})
+    with np.load(io.BytesIO(_from_writer(buffer.getvalue())), allow_pickle=False) as file:
+        return [file[str(index)] for index in range(len(file.files))]
+
+
+def pool_from_writer(read: Callable[[], Demonstrations | None]) -> Demonstrations | None:
+    """As `from_writer`, for a pool of demonstrations."""
+    held: list[Demonstrations | None] = [None]
+
+    def metadata() -> Any:
+        held[0] = read()
+        return None if held[0] is None else held[0].metadata
+
+    if jax.process_count() == 1:
+        return read()
+    found = from_writer(metadata)
+    if found is None:
+        return None
+    pool = held[0]
+    mine = None if pool is None else [*pool.transition, pool.truncated, pool.episode]
+    *transition, truncated, episode = arrays_from_writer(mine)
+    return Demonstrations(Transition(*transition), truncated, episode, found)
+
+
+def alone(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function of orbax's on one process; the arguments and the result are pickled.
+
+    Orbax's `save` meets all processes, also when told that one is active: with several of them it
+    works in a child that knows of no others.
+    """
+    if jax.process_count() == 1:
+        return function(*arguments)
+    return _clerk().submit(function, *arguments).result()
+
+
+@functools.cache
+def _clerk() -> concurrent.futures.Executor:
+    spawn = multiprocessing.get_context("spawn")
+    pool = concurrent.futures.ProcessPoolExecutor(1, spawn, _be_clerk)
+    atexit.register(pool.shutdown)
+    return pool
+
+
+def _be_clerk() -> None:
+    jax.config.update("jax_platforms", "cpu")
+    # Whoever stops the run stops its parent, which may still want something saved.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    _end_after(parent.join)
+
+
+def _end_after(wait: Callable[[], Any]) -> None:
+    """End this process as soon as `wait`, which a thread calls, returns."""
+
+    def end() -> None:
+        wait()
+        os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()
+
+
+def _from_writer(data: bytes) -> bytes:
+    """Process 0's bytes, on every process."""
+    if not is_writer():
+        data = b""
+    size = int(_total(np.int32([len(data)]))[0])
+    block = np.zeros(-(-size // _BLOCK) * _BLOCK, np.uint8)
+    block[: len(data)] = np.frombuffer(data, np.uint8)
+    return _total(block)[:size].tobytes()
+
+
+def _total(mine: np.ndarray) -> np.ndarray:
+    """The sum over processes of arrays of one shape."""
+    split, add = _adder(jax.process_count())
+    return np.asarray(add(jax.make_array_from_process_local_data(split, mine[None])))
+
+
+@functools.cache
+def _adder(processes: int) -> tuple[jax.sharding.NamedSharding, Callable[[jax.Array], jax.Array]]:
+    firsts = np.asarray([_of_process(process)[0] for process in range(processes)])
+    split = jax.sharding.NamedSharding(
+        jax.sharding.Mesh(firsts, ("processes",)), jax.P("processes")
+    )
+    whole = split.update(spec=jax.P())
+    return split, jax.jit(lambda stacked: stacked.sum(0, dtype=stacked.dtype), out_shardings=whole)
