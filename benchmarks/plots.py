@@ -1,4 +1,4 @@
-"""The plot of how cost grows."""
+"""Plots of what was measured."""
 
 from pathlib import Path
 from typing import Any
@@ -43,3 +43,20 @@ def growth(records: list[dict[str, Any]], path: Path) -> None:
 
 def _standard(record: dict[str, Any]) -> bool:
     return record["suite"] == "seeds" and record["seeds"] == 100
+
+
+def soak(samples: list[dict[str, Any]], path: Path) -> None:
+    """What a process held while it finished cell after cell."""
+    minutes = [sample["seconds"] / 60 for sample in samples]
+    panels = {
+        "resident memory, MiB": [sample["resident_bytes"] / 2**20 for sample in samples],
+        "open files": [sample["open_files"] for sample in samples],
+        "threads": [sample["threads"] for sample in samples],
+        "cells finished": [sample["cells"] for sample in samples],
+    }
+    figure, axes = plt.subplots(1, 4, figsize=(14, 3.2), constrained_layout=True)
+    for axis, (label, values) in zip(axes, panels.items(), strict=True):
+        axis.plot(minutes, values)
+        axis.set(xlabel="minutes", ylabel=label, ylim=(0, None))
+    figure.savefig(path, dpi=150)
+    plt.close(figure)

@@ -1,0 +1,148 @@
+"""`python -m benchmarks.checkpoint_cost`: what checkpoints cost a run, with against without."""
+
+import dataclasses
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import tyro
+from rich.console import Console
+
+from benchmarks import measuring
+from cmedirl_jax import envs, seeds
+from cmedirl_jax.methods import METHODS, Settings
+from experiments import cells, checkpoints, compilation, judging, programs
+from experiments.bookkeeping import Budget
+from experiments.checkpoints import Keeper
+from experiments.interruption import Interruption
+from experiments.presets import Grid
+from experiments.programs import Programs
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to measure, and where to write it."""
+
+    seeds: int = 100
+    """Learners of the cell, DDPG as `run_grid` trains it, on every core."""
+    steps: int = 4_000
+    """Steps of each; the replay saved is the main job's, of 12,000."""
+    every: float = 2.0
+    """Seconds between checkpoints: far more of them than a run makes, so that their cost shows."""
+    rounds: int = 5
+    """How often the cell is trained with and without, in turn."""
+    json: Path | None = None
+    """File for the measurements."""
+
+
+class _Timed(Keeper):
+    """Notes how long training stood still for each checkpoint."""
+
+    blocked: float = 0.0
+    saved: int = 0
+
+    def visit(self, step, take):
+        began = time.perf_counter()
+        due = time.monotonic() >= self._due
+        super().visit(step, take)
+        self.blocked += time.perf_counter() - began
+        self.saved += due
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print; returns the exit code."""
+    options = tyro.cli(Options, prog="python -m benchmarks.checkpoint_cost", args=arguments)
+    compilation.use_cache()
+    jax.config.update("jax_num_cpu_devices", max(1, measuring.cores()))
+    compiled = _compile(options)
+    result = measuring.heading("checkpoint_cost") | _measure(options, compiled)
+    console = Console()
+    console.print(
+        f"{result['checkpoint_bytes'] / 1e6:.0f} MB a checkpoint, {result['checkpoints']} of them: "
+        f"training stood still for {result['blocked_seconds']:.3f} s each; one every "
+        f"{options.every:g} s took {result['cost']:.1%} ({result['cost_low']:.1%} to "
+        f"{result['cost_high']:.1%} over {options.rounds} rounds) of the time. At one every "
+        f"{Grid.checkpoint_every:g} s, the default: {result['cost_by_default']:.2%}.",
+        highlight=False,
+    )
+    if options.json is not None:
+        measuring.write(result, options.json)
+    return 0
+
+
+def _compile(options: Options) -> Programs:
+    env, settings, devices = envs.make(Grid.env), Settings(), jax.devices()
+    hidden = settings.architecture.hidden
+    group = seeds.group_size(options.seeds, len(devices), hidden)
+    return programs.compile_method(
+        env,
+        METHODS["ddpg"],
+        settings,
+        judging.of_networks(env, settings.architecture, group, devices),
+        programs.compile_networks(env, settings.architecture, group, devices),
+        group=group,
+        seeds_count=options.seeds,
+        devices=devices,
+        capacity=Grid.max_steps or options.steps,
+        subset_size=None,
+    )
+
+
+def _measure(options: Options, compiled: Programs) -> dict[str, object]:
+    def seconds(keeper: Keeper | None) -> float:
+        began = time.perf_counter()
+        cells.train(
+            compiled,
+            jax.random.key(0),
+            None,
+            0,
+            seeds_count=options.seeds,
+            budget=Budget(options.steps, None, 250, 10),
+            threshold=0.0,
+            report=lambda progress: None,
+            keeper=keeper,
+        )
+        if keeper is not None:
+            keeper.wait()
+        return time.perf_counter() - began
+
+    seconds(None)
+    ratios, keepers = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(options.rounds):
+            keeper = _Timed(
+                Path(folder) / str(number),
+                {},
+                every=options.every,
+                interruption=Interruption(),
+                say=lambda line: print(line, file=sys.stderr),
+            )
+            without = seconds(None)
+            ratios.append(seconds(keeper) / without)
+            keepers.append(keeper)
+            size = sum(path.stat().st_size for path in keeper.folder.rglob("*") if path.is_file())
+            kept = len(list(keeper.folder.iterdir()))
+    count = sum(keeper.saved for keeper in keepers)
+    cost = statistics.median(ratios) - 1.0
+    return {
+        "seeds": options.seeds,
+        "steps": options.steps,
+        "every_seconds": options.every,
+        "rounds": options.rounds,
+        "checkpoints": count,
+        "checkpoint_bytes": size // kept,
+        "kept": checkpoints.KEPT,
+        "blocked_seconds": sum(keeper.blocked for keeper in keepers) / count,
+        "cost": cost,
+        "cost_low": min(ratios) - 1.0,
+        "cost_high": max(ratios) - 1.0,
+        "cost_by_default": cost * options.every / Grid.checkpoint_every,
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

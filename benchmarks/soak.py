@@ -1,0 +1,104 @@
+"""`python -m benchmarks.soak`: thousands of seeds in one process, and what it holds meanwhile."""
+
+import dataclasses
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import psutil
+import tyro
+from rich.console import Console
+
+from benchmarks import measuring, plots
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How much to run, and where to write what was seen."""
+
+    cells: int = 20
+    """Cells one after the other: HS-ME-DDPG by the smoke preset, with 1, 2, 3, ... demonstrations."""
+    seeds: int = 100
+    """Seeds of each cell."""
+    json: Path | None = None
+    """File for the measurements; a plot is drawn beside it."""
+
+
+class Sample(NamedTuple):
+    """What the process held at a moment."""
+
+    seconds: float
+    cells: int
+    resident_bytes: int
+    open_files: int
+    threads: int
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run and watch; returns the run's exit code."""
+    options = tyro.cli(Options, prog="python -m benchmarks.soak", args=arguments)
+    with tempfile.TemporaryDirectory() as folder:
+        code, samples = watch(options, Path(folder) / "run")
+    if code:
+        return code
+    growth = growth_per_cell(samples)
+    most = max(sample.resident_bytes for sample in samples)
+    Console().print(
+        f"{options.cells * options.seeds:,} seeds: {most / 2**20:.0f} MiB at most, "
+        f"{growth / 2**20:+.2f} MiB a cell once a quarter is done; "
+        f"{samples[-1].open_files} open files at the end",
+        highlight=False,
+    )
+    if options.json is not None:
+        result = measuring.heading("soak") | {
+            "growth_bytes_per_cell": growth,
+            "samples": [sample._asdict() for sample in samples],
+        }
+        measuring.write(result, options.json)
+        plots.soak(result["samples"], options.json.with_suffix(".png"))
+    return 0
+
+
+def watch(options: Options, run: Path) -> tuple[int, list[Sample]]:
+    """Run the cells in a process of their own, saving after every chunk; look at it each second."""
+    command = [
+        *(sys.executable, "-m", "experiments.run_grid", "--preset", "smoke", "--out", str(run)),
+        *("--methods", "hs-me-ddpg", "--seeds", str(options.seeds), "--checkpoint-every", "0"),
+        *("--n-demos", *(str(1 + number) for number in range(options.cells))),
+    ]
+    began, samples = time.monotonic(), []
+    with subprocess.Popen(command) as process:
+        watched = psutil.Process(process.pid)
+        while process.poll() is None:
+            with watched.oneshot():
+                sample = Sample(
+                    time.monotonic() - began,
+                    len(list(run.glob("rewards/*[0-9]"))),
+                    watched.memory_info().rss,
+                    watched.num_fds(),
+                    watched.num_threads(),
+                )
+            samples.append(sample)
+            time.sleep(1.0)
+    # The last look may have met a process that was letting go of what it held.
+    return process.returncode, samples[:-1]
+
+
+def growth_per_cell(samples: Sequence[Sample]) -> float:
+    """Slope of the resident bytes over finished cells, once a quarter of the cells is done.
+
+    Of each cell the least, so that what one cell needs for a while does not count.
+    """
+    cells = np.array([sample.cells for sample in samples])
+    resident = np.array([sample.resident_bytes for sample in samples])
+    late = [number for number in np.unique(cells) if number >= cells.max() / 4]
+    return float(np.polyfit(late, [resident[cells == number].min() for number in late], 1)[0])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
