@@ -22,7 +22,7 @@ class Options:
     """How much to run, and where to write what was seen."""
 
     cells: int = 20
-    """Cells one after the other: HS-ME-DDPG by the smoke preset, with 1, 2, 3, ... demonstrations."""
+    """Cells one after the other: HS-ME-DDPG, smoke preset, with 1, 2, 3, ... demonstrations."""
     seeds: int = 100
     """Seeds of each cell."""
     json: Path | None = None
