@@ -10,6 +10,7 @@ from cmedirl_jax import (
     exploration,
     irl,
     networks,
+    ranges,
     replay,
     rewards,
 )
@@ -48,8 +49,9 @@ def compose(spec: EnvSpec, method: Method, settings: Settings, capacity: int) ->
     """Make a method's parts; `capacity` is the replay's where the settings leave it open.
 
     Raises:
-        ValueError: for parts that do not fit each other.
+        ValueError: for numbers out of their range, or parts that do not fit each other.
     """
+    ranges.check(settings)
     schedule, hparams = settings.reward_schedule, settings.reward
     shaping = schedule.shaping or method.shaping
     agent = ddpg.make(spec, settings.agent, networks=networks.make(spec, settings.architecture))

@@ -68,11 +68,11 @@ def refused(main, tmp_path, capsys):
     [
         (
             "--methods maxent-irl --tabular.states 1",
-            "--tabular: a grid needs two points along each dimension, got (1, 1)",
+            "--tabular.states: must be at least 2, got 1",
         ),
         (
             "--methods maxent-irl --tabular.centres 1",
-            "--tabular: radial basis functions need two centres or more, got 1",
+            "--tabular.centres: must be at least 2, got 1",
         ),
         ("--tabular.steps 0", "--tabular.steps: must be at least 1, got 0"),
         (
@@ -99,7 +99,18 @@ def refused(main, tmp_path, capsys):
         ),
         ("--max-steps None", "--max-steps: give a number, or give --max-episodes"),
         ("--seed -1", "--seed: must be between 0 and 2^32 - 1, got -1"),
-        ("--demos none.npz", "--demos: there is no file none.npz"),
+        (
+            "--demos none.npz",
+            "--demos: there is no file none.npz; give one that demonstrations.save wrote",
+        ),
+        (
+            "--demos D4RL/door/human-v2",
+            "--demos: there is no file D4RL/door/human-v2; give one that demonstrations.save wrote",
+        ),
+        (
+            f"--max-steps None --max-episodes {2**31 - 1}",
+            f"--max-episodes: makes {999 * (2**31 - 1)} steps, more than 2^31 - 1",
+        ),
     ],
 )
 def test_what_cannot_work_is_refused_in_a_line(refused, arguments, line):
