@@ -26,6 +26,9 @@ PACKAGES = ("jax", "jaxlib", "flax", "optax", "chex", "gymnasium", "numpy", "orb
 TABLES = ("seeds", "episodes", "evaluations")
 """In the order they are written."""
 
+DAMAGED = (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException)
+"""What reading a damaged table raises; polars panics where a flipped bit breaks its assumptions."""
+
 _NOT_COMPARED = ("out", "devices")
 
 
@@ -84,7 +87,7 @@ def _compare(path: Path, config: dict[str, Any]) -> None:
     try:
         written = json.loads(path.read_text())
         schema, before = written["schema"], _flat(written["config"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"--out: {path} is not a readable configuration ({error})") from error
     if schema != SCHEMA:
         raise UserError(f"--out: {path} has schema {schema!r}, this version writes {SCHEMA}")
@@ -119,7 +122,7 @@ def finished(folder: Path) -> set[tuple[str, int]]:
         if evaluations is None:
             return set()
         return set(evaluations.select("method", "n_demos").unique().iter_rows())
-    except (OSError, pl.exceptions.PolarsError) as error:
+    except DAMAGED as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"--out: {folder} holds a damaged table ({reason})") from error
 
