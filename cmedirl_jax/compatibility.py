@@ -86,11 +86,6 @@ def _reward(method: Method, settings: Settings, shaping: Shaping) -> None:
         raise ValueError(f"{method.name} is r_D alone: leave reward_schedule.shaping")
     if alone and schedule.anneal_steps is not None:
         raise ValueError("r_D alone must not fade: leave reward_schedule.anneal_steps")
-    if not 0 < hparams.bound < float("inf"):
-        raise ValueError(
-            f"reward.bound must be positive and finite, got {hparams.bound}; for an unbounded "
-            "reward take reward.bounded_by none"
-        )
     if potential and method.tabular is not None and settings.tabular.reward != "state":
         raise ValueError("a potential is a function of the state: take tabular.reward state")
     if (potential or absorbing) and settings.agent.bootstrap_at_termination:

@@ -5,11 +5,13 @@ from typing import NamedTuple
 
 from cmedirl_jax import (
     background,
+    checks,
     compatibility,
     ddpg,
     exploration,
     irl,
     networks,
+    ranges,
     replay,
     rewards,
 )
@@ -48,8 +50,11 @@ def compose(spec: EnvSpec, method: Method, settings: Settings, capacity: int) ->
     """Make a method's parts; `capacity` is the replay's where the settings leave it open.
 
     Raises:
-        ValueError: for parts that do not fit each other.
+        ValueError: for a specification that does not agree with itself, numbers out of their range,
+            or parts that do not fit each other.
     """
+    checks.env_spec(spec)
+    ranges.check(settings)
     schedule, hparams = settings.reward_schedule, settings.reward
     shaping = schedule.shaping or method.shaping
     agent = ddpg.make(spec, settings.agent, networks=networks.make(spec, settings.architecture))

@@ -103,6 +103,7 @@ class UpdateFn(Protocol):
 
         Raises:
             ValueError: if the batch's shapes are not `[B, O]`, `[B, A]` and `[B]`.
+            TypeError: if its leaves are not floats, and `terminated` bool.
         """
         ...
 
@@ -116,6 +117,8 @@ class DDPG(NamedTuple):
         act: `(state, observation [..., O]) -> action [..., A]`, mu(s), without noise.
         value: `(state, observation [..., O], action [..., A]) -> [...]`, Q(s, a).
         update: see `UpdateFn`.
+
+    While tracing they raise ValueError for other shapes and TypeError for other dtypes.
     """
 
     networks: ActorCritic
@@ -142,7 +145,11 @@ def make(
         actor_optimizer: default Adam at `state.hparams.actor_learning_rate`. Any other optax
             transformation holds its own rate, or reads `learning_rate=` as an extra argument.
         critic_optimizer: likewise.
+
+    Raises:
+        ValueError: if the specification does not agree with itself.
     """
+    checks.env_spec(spec)
     hparams = hparams or DDPGHParams()
     networks = networks or networks_lib.make(spec)
     actor_tx = optax.with_extra_args_support(actor_optimizer or optimizers.adam())
@@ -165,9 +172,11 @@ def make(
         )
 
     def act(state: DDPGState, observation: jax.Array) -> jax.Array:
+        checks.pairs(spec, observation)
         return networks_lib.policy(networks, state.actor, observation)
 
     def value(state: DDPGState, observation: jax.Array, action: jax.Array) -> jax.Array:
+        checks.pairs(spec, observation, action)
         return networks.critic.apply(state.critic, observation, action)
 
     def update_critic(state: DDPGState, batch: Transition):
@@ -224,9 +233,9 @@ def make(
         update_targets: Numeric = True,
         clone: Numeric = True,
     ) -> tuple[DDPGState, DDPGInfo]:
-        checks.transition_shapes(spec, batch, batch.observation.shape[:1], "batch")
+        checks.transition_shapes(spec, batch, jnp.shape(batch.observation)[:1], "batch")
         if demonstrations is not None:
-            leading = demonstrations.observation.shape[:1]
+            leading = jnp.shape(demonstrations.observation)[:1]
             checks.transition_shapes(spec, demonstrations, leading, "demonstrations")
         state, critic_loss_value, q_mean = update_critic(state, batch)
         state, actor_loss_value = _when(

@@ -6,8 +6,11 @@ learners with different demonstrations share one array, and nothing is ragged.
 """
 
 import json
+import math
+import stat
+import zipfile
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +20,9 @@ from cmedirl_jax.types import Array, EnvSpec, Numeric, Transition
 
 FORMAT = "cmedirl_jax.demonstrations"
 FORMAT_VERSION = 1
+
+_DEFLATE_RATIO = 1032
+"""No deflate stream is longer unpacked than so many times its length."""
 
 
 class Demonstrations(NamedTuple):
@@ -161,13 +167,13 @@ def validate(demonstrations: Demonstrations, spec: EnvSpec | None = None) -> Non
         kinds = {"terminated": "b", "truncated": "b", "episode": "i"}
         if array.dtype.kind != kinds.get(name, "f"):
             raise ValueError(f"{name} has dtype {array.dtype}")
-        if not np.isfinite(array).all():
+        if not (np.abs(array) <= np.finfo(np.float32).max).all():
             raise ValueError(f"{name} holds values that are not finite")
     if arrays["observation"].shape != arrays["next_observation"].shape:
         raise ValueError("observation and next_observation differ in shape")
     if spec is not None:
         _validate_sizes(arrays, spec)
-    change = np.diff(arrays["episode"])
+    change = np.diff(arrays["episode"].astype(np.int64))
     if arrays["episode"][0] != 0 or not np.isin(change, (0, 1)).all():
         raise ValueError("episode must count 0, 0, ..., 1, 1, ... without gaps")
     ended = arrays["terminated"] | arrays["truncated"]
@@ -216,11 +222,14 @@ def load(path: str | Path, spec: EnvSpec | None = None) -> Demonstrations:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged, foreign, of a newer version, or not valid for `spec`.
+        ValueError: if it is no regular file, damaged, foreign, of a newer version, or not valid for
+            `spec`.
     """
     path = Path(path)
-    with path.open("rb") as file:
-        header, arrays = _read(path, file)
+    # A pipe might never end, or never begin.
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise ValueError(f"{path}: not a regular file")
+    header, arrays = _read(path)
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ValueError(f"{path}: not a demonstrations file of this library")
     if header.get("version") != FORMAT_VERSION:
@@ -242,11 +251,39 @@ def load(path: str | Path, spec: EnvSpec | None = None) -> Demonstrations:
     return result
 
 
-def _read(path: Path, file: BinaryIO) -> tuple[Any, dict[str, np.ndarray]]:
-    names = [*Transition._fields, "truncated", "episode"]
+def _read(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
+    names = ["header", *Transition._fields, "truncated", "episode"]
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            return json.loads(str(archive["header"][()])), {name: archive[name] for name in names}
+        with zipfile.ZipFile(path) as archive:
+            for name in names:
+                _check_size(archive, f"{name}.npy", path.stat().st_size)
+            header, *arrays = (_read_array(archive, f"{name}.npy") for name in names)
+            return json.loads(str(header[()])), dict(zip(names[1:], arrays, strict=True))
     except Exception as error:
         # A damaged archive raises whatever zipfile, zlib, json or numpy happen to stumble over.
-        raise ValueError(f"{path}: not a readable demonstrations file ({error})") from error
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{path}: not a readable demonstrations file ({reason})") from error
+
+
+def _check_size(archive: zipfile.ZipFile, name: str, length: int) -> None:
+    """Refuse an array that claims more bytes than a file of this length can hold, unread."""
+    entry = archive.getinfo(name)
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name} is compressed by another method")
+    with archive.open(entry) as file:
+        major, _ = np.lib.format.read_magic(file)
+        read_header = {
+            1: np.lib.format.read_array_header_1_0,
+            2: np.lib.format.read_array_header_2_0,
+        }[major]
+        shape, _, dtype = read_header(file)
+        size = file.tell() + math.prod(shape) * dtype.itemsize
+    if dtype.hasobject:
+        raise ValueError(f"{name} holds pickled objects")
+    if size != entry.file_size or size > _DEFLATE_RATIO * min(entry.compress_size, length):
+        raise ValueError(f"{name} claims {size} bytes, which are not there")
+
+
+def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    with archive.open(name) as file:
+        return np.lib.format.read_array(file, allow_pickle=False)

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from cmedirl_jax import checks, lattice
 from cmedirl_jax import demonstrations as demonstrations_lib
-from cmedirl_jax import lattice
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.demonstrations import Demonstrations, DemonstrationSubset
 from cmedirl_jax.networks import ActorCritic
@@ -106,12 +106,21 @@ def fit(
 
     Returns:
         The fitted `(actor, critic)`.
+
+    Raises:
+        ValueError: if the pool is not of the networks' sizes, or a size of `hparams` not positive.
+        TypeError: if a leaf of the pool is not of its dtype.
     """
     hparams = hparams or HotStartHParams()
+    checks.sizes(cells=hparams.cells, steps=hparams.steps, batch_size=hparams.batch_size)
     if isinstance(demonstrations, Demonstrations):
         demonstrations = data(demonstrations)
     pool = jax.tree.map(jnp.asarray, demonstrations)
     chosen = pool.episodes if subset is None else subset
+    size = pool.transition.observation.shape[:1]
+    checks.transition_shapes(networks.spec, pool.transition, size, "demonstrations")
+    checks.shape("discounted_return", pool.discounted_return, size)
+    checks.shape("subset.length", chosen.length, jnp.shape(chosen.start)[:1])
     optimizer = optax.adam(hparams.learning_rate)
 
     def loss(params: tuple[Params, Params], index: jax.Array):

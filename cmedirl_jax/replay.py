@@ -31,7 +31,8 @@ class Replay(NamedTuple):
 
     Attributes:
         init: `() -> ReplayState`, empty.
-        add: `(state, transition) -> ReplayState`; overwrites the oldest once full.
+        add: `(state, transition) -> ReplayState`; overwrites the oldest once full. One transition:
+            leaves `[O]`, `[A]` and `[]`, else ValueError, or TypeError for other dtypes.
         sample: `(key, state, batch_size, recent=None) -> Transition`, leaves `[batch_size, ...]`:
             uniform with replacement over what is there, or over its `recent` latest transitions.
             An empty buffer gives zeros.
@@ -63,6 +64,7 @@ def make(spec: EnvSpec, capacity: int) -> Replay:
         return ReplayState(jnp.zeros((capacity, row_size(spec))), jnp.zeros((), jnp.int32))
 
     def add(state: ReplayState, transition: Transition) -> ReplayState:
+        checks.transition_shapes(spec, transition, (), "transition")
         row = pack(spec, transition)
         position = state.count % capacity
         return ReplayState(state.storage.at[position].set(row), state.count + 1)
@@ -100,6 +102,7 @@ def pack(spec: EnvSpec, transition: Transition) -> jax.Array:
 
     Raises:
         ValueError: if a leaf is not of `spec`'s size.
+        TypeError: if it is not of floats, or `terminated` not bool.
     """
     checks.transition_shapes(spec, transition, jnp.shape(transition.reward), "transition")
     return jnp.concatenate(

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import composition, initialisation, schedules, updates
+from cmedirl_jax import composition, envs, initialisation, schedules, updates
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.composition import Algorithm
 from cmedirl_jax.ddpg import DDPGState
@@ -108,13 +108,16 @@ def make(
             traced: one program for every number of demonstrations.
 
     Raises:
-        ValueError: for a method without networks (`tabular.imitation` fits those), or settings that
-            do not fit each other.
+        ValueError: for a method without networks (`tabular.imitation` fits those), an environment
+            that does not keep to its specification, numbers out of their range, or settings that do
+            not fit each other.
+        TypeError: for an environment of other dtypes.
     """
     if method.tabular and not method.interacts:
         raise ValueError(f"{method.name} does not act: there is nothing to train")
     settings = settings or Settings()
     env_params = env.default_params if env_params is None else env_params
+    envs.check(env, env_params)
     algorithm = composition.compose(env.spec, method, settings, capacity)
     agent, exploration, replay = algorithm.agent, algorithm.exploration, algorithm.replay
     background = algorithm.background

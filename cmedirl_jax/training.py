@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import demonstrations as demonstrations_lib
 from cmedirl_jax import evaluation, hot_start, methods
 from cmedirl_jax import seeds as seeds_lib
 from cmedirl_jax.demonstrations import Demonstrations
@@ -59,8 +60,9 @@ def fit(
         evaluation_starts: start states per evaluation.
 
     Raises:
-        ValueError: for an unknown method, missing demonstrations, sizes that are not positive, or
-            `steps` that are no multiple of `evaluate_every`.
+        ValueError: for an unknown method, missing demonstrations or some that are not valid for
+            the environment, sizes that are not positive, `steps` that are no multiple of
+            `evaluate_every`, or what `make` refuses.
     """
     if isinstance(method, str):
         if method not in methods.METHODS:
@@ -73,6 +75,7 @@ def fit(
     settings = settings or Settings()
     data, n = None, 0
     if demonstrations is not None and method.uses_demonstrations:
+        demonstrations_lib.validate(demonstrations, env.spec)
         agent = settings.agent
         data = hot_start.data(demonstrations, agent.discount, agent.reward_scale)
         n = len(data.episodes.start) if n_demonstrations is None else n_demonstrations

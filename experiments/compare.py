@@ -5,10 +5,11 @@ differences are of pairs, their intervals bootstrapped over pairs, their p-value
 the signs of pairs, adjusted for the number of cells by Holm's method.
 """
 
+import contextlib
 import dataclasses
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -69,19 +70,24 @@ def compare(folder: Path, against: str) -> pl.DataFrame:
     """The paired differences of a finished run's cells to the cell of the method `against`.
 
     Raises:
-        UserError: if the folder holds no run, one whose cells end at different steps, a single
-            seed, no cell of that method, or none to compare with it.
+        UserError: if the folder holds no run, a damaged one, one whose cells end at different
+            steps, a single seed, no cell of that method, or none to compare with it.
     """
-    path = folder / "config.json"
-    if not path.exists() or results.read(folder, "evaluations") is None:
+    if not all((folder / name).exists() for name in ("config.json", "evaluations.parquet")):
         raise UserError(f"{folder}: holds no finished cell of a run")
-    config = json.loads(path.read_text())["config"]
-    if config["max_episodes"] is not None:
+    with _undamaged(folder):
+        config = json.loads((folder / "config.json").read_text())["config"]
+        episodes, seeds_count = config["max_episodes"], int(config["seeds"])
+    if episodes is not None:
         raise UserError(f"{folder}: a run over episodes, whose seeds end at different steps")
-    if config["seeds"] < 2:
+    if seeds_count < 2:
         raise UserError(f"{folder}: one seed has no interval")
-    threshold = envs.make(config["env"]).spec.reward_threshold
-    cells = _seed_statistics(folder, threshold)
+    with _undamaged(folder):
+        most, threshold = int(config["max_steps"]), envs.make(config["env"]).spec.reward_threshold
+        cells = _seed_statistics(folder, threshold)
+        for (method, _), seeds in cells.items():
+            if seeds.area.size != seeds_count or not np.isfinite(seeds.area).all():
+                raise ValueError(f"{method} has no finite returns of {seeds_count} seeds")
     references = {n_demos: seeds for (method, n_demos), seeds in cells.items() if method == against}
     if not references:
         methods = ", ".join(sorted({method for method, _ in cells}))
@@ -94,7 +100,7 @@ def compare(folder: Path, against: str) -> pl.DataFrame:
             pairs[method, n_demos] = seeds, reference
     if not pairs:
         raise UserError(f"{folder}: holds no method beside {against} to compare with it")
-    most, rows = config["max_steps"], []
+    rows = []
     for name, measure in MEASURES.items():
         found = [
             {
@@ -108,6 +114,16 @@ def compare(folder: Path, against: str) -> pl.DataFrame:
         adjusted = holm(np.array([row["p_value"] for row in found]))
         rows += [row | {"p_holm": p} for row, p in zip(found, adjusted, strict=True)]
     return pl.DataFrame(rows)
+
+
+@contextlib.contextmanager
+def _undamaged(folder: Path) -> Iterator[None]:
+    """Turn whatever json, polars or numpy stumble over in a damaged file into a user's error."""
+    try:
+        yield
+    except (Exception, pl.exceptions.PanicException) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise UserError(f"{folder}: holds a damaged file ({reason})") from error
 
 
 def holm(p_values: np.ndarray) -> np.ndarray:

@@ -1,7 +1,6 @@
 """What a run will do, and whether it can: cells, budget, and every refusal before any work."""
 
-import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 
@@ -10,6 +9,7 @@ from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.methods import METHODS, ExplorationSettings, Method
 from cmedirl_jax.tabular import imitation
+from experiments import bounds
 from experiments.bookkeeping import Budget
 from experiments.errors import UserError
 from experiments.presets import Grid
@@ -70,15 +70,8 @@ def check(grid: Grid) -> None:
             raise UserError(f"--{name.replace('_', '-')}: give one or more, each once")
     if grid.max_steps is None and grid.max_episodes is None:
         raise UserError("--max-steps: give a number, or give --max-episodes")
-    if not 0 <= grid.seed < 2**32:
-        raise UserError(f"--seed: must be between 0 and 2^32 - 1, got {grid.seed}")
-    for name, value in _positive(grid):
-        if value is not None and value < 1:
-            raise UserError(f"--{name.replace('_', '-')}: must be at least 1, got {value}")
-    frozen = grid.settings.schedule.frozen_actor_steps
-    if frozen < 0:
-        raise UserError(f"--schedule.frozen-actor-steps: must be at least 0, got {frozen}")
-    _check_noise(grid.settings.exploration)
+    bounds.check(grid)
+    _check_epsilon(grid.settings.exploration)
     try:
         networks.make(env.spec, grid.settings.architecture)
     except ValueError as error:
@@ -90,6 +83,8 @@ def check(grid: Grid) -> None:
         except ValueError as error:
             raise UserError(f"--tabular: {error}") from error
     capacity = budget_of(grid, env).max_steps
+    if capacity >= 2**31:
+        raise UserError(f"--max-episodes: makes {capacity} steps, more than 2^31 - 1")
     for name in grid.methods:
         try:
             composition.compose(env.spec, METHODS[name], grid.settings, capacity)
@@ -99,77 +94,11 @@ def check(grid: Grid) -> None:
         check_enough(grid, grid.experts.trajectories)
 
 
-def _check_noise(settings: ExplorationSettings) -> None:
+def _check_epsilon(settings: ExplorationSettings) -> None:
     factor, epsilon = settings.hot_start_factor, settings.epsilon_greedy
-    if not 0.0 < factor < math.inf:
-        raise UserError(
-            f"--exploration.hot-start-factor: must be positive and finite, got {factor}"
-        )
     largest = factor * max(epsilon.epsilon_start, epsilon.epsilon_end)
-    if settings.kind == "epsilon-greedy" and factor > 1.0 and largest > 1.0:
+    if settings.kind == "epsilon-greedy" and largest > 1.0:
         raise UserError(f"--exploration.hot-start-factor: makes epsilon {largest:g}, above 1")
-
-
-def _positive(grid: Grid) -> list[tuple[str, float | None]]:
-    """Options that must be positive."""
-    settings = grid.settings
-    named = [("n_demos", number) for number in grid.n_demos]
-    named += [
-        (name, getattr(grid, name))
-        for name in (
-            "seeds",
-            "max_steps",
-            "max_episodes",
-            "evaluate_every",
-            "evaluation_starts",
-            "evaluate_every_episodes",
-            "evaluation_starts_episodes",
-            "devices",
-            "group",
-        )
-    ]
-    groups: list[tuple[str, Any, tuple[str, ...]]] = [
-        ("experts", grid.experts, ("seeds", "steps", "trajectories")),
-        (
-            "schedule",
-            settings.schedule,
-            (
-                "batch_size",
-                "replay_capacity",
-                "update_period",
-                "target_period",
-                "behaviour_cloning_steps",
-            ),
-        ),
-        (
-            "reward_schedule",
-            settings.reward_schedule,
-            (
-                "period",
-                "iterations",
-                "anneal_steps",
-                "batch_size",
-                "recent",
-                "snapshots",
-                "snapshot_period",
-                "trajectories",
-                "episodes",
-            ),
-        ),
-        ("hot_start", settings.hot_start, ("steps", "cells", "batch_size")),
-        ("tabular", settings.tabular, ("subsamples", "steps")),
-        (
-            "exploration.epsilon-greedy",
-            settings.exploration.epsilon_greedy,
-            ("epsilon_steps", "hold"),
-        ),
-    ]
-    for prefix, options, names in groups:
-        named += [(f"{prefix}.{name}", getattr(options, name)) for name in names]
-    named += [("architecture.hidden", units) for units in settings.architecture.hidden]
-    named += [("reward_network.hidden", units) for units in settings.reward_network.hidden]
-    named += [("tabular.hidden", units) for units in settings.tabular.hidden]
-    return named
 
 
 def load_demonstrations(grid: Grid, env: Env) -> Demonstrations:
@@ -182,8 +111,12 @@ def load_demonstrations(grid: Grid, env: Env) -> Demonstrations:
     try:
         pool = demonstrations.load(grid.demos, env.spec)
     except FileNotFoundError as error:
-        raise UserError(f"--demos: there is no file {grid.demos}") from error
-    except (OSError, ValueError) as error:
+        raise UserError(
+            f"--demos: there is no file {grid.demos}; give one that demonstrations.save wrote"
+        ) from error
+    except OSError as error:
+        raise UserError(f"--demos: {grid.demos}: {error.strerror}") from error
+    except ValueError as error:
         raise UserError(f"--demos: {error}") from error
     check_enough(grid, int(pool.episode[-1]) + 1)
     return pool

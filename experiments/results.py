@@ -32,6 +32,9 @@ PACKAGES = (
 TABLES = ("seeds", "episodes", "evaluations")
 """In the order they are written."""
 
+DAMAGED = (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException)
+"""What reading a damaged table raises; polars panics where a flipped bit breaks its assumptions."""
+
 _LOCK = ".lock"
 _NOT_COMPARED = (
     *("out", "devices", "distributed", "coordinator", "processes", "process_id"),
@@ -92,8 +95,9 @@ def opened(grid: Grid) -> Iterator[Path]:
             _configure(grid)
             yield folder
         except UserError:
-            if not (folder / "evaluations.parquet").exists():
-                for path in set(folder.iterdir()) - before:
+            new = set(folder.iterdir()) - before
+            if folder / "evaluations.parquet" not in new:
+                for path in new:
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
                 for path in made:
                     path.rmdir()
@@ -154,7 +158,7 @@ def _compare(path: Path, config: dict[str, Any]) -> None:
     try:
         written = json.loads(path.read_text())
         schema, before = written["schema"], _flat(written["config"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"--out: {path} is not a readable configuration ({error})") from error
     if schema != SCHEMA:
         raise UserError(f"--out: {path} has schema {schema!r}, this version writes {SCHEMA}")
@@ -189,7 +193,7 @@ def finished(folder: Path) -> set[tuple[str, int]]:
         if evaluations is None:
             return set()
         return set(evaluations.select("method", "n_demos").unique().iter_rows())
-    except (OSError, pl.exceptions.PolarsError) as error:
+    except DAMAGED as error:
         reason = str(error).splitlines()[0]
         raise UserError(f"--out: {folder} holds a damaged table ({reason})") from error
 

@@ -96,7 +96,9 @@ def test_infos_are_of_the_state_before_the_update():
 def test_what_the_mask_leaves_out_does_not_count():
     demonstrations, background = masked(1, 7), masked(2, 5)
     spoilt = jax.tree.map(
-        lambda leaf: jnp.where(background.mask.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 1),
+        lambda leaf: jnp.where(
+            background.mask.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.ones_like(leaf)
+        ),
         background.transition,
     )
     found = update(begun(), demonstrations, background)

@@ -7,7 +7,7 @@ from cmedirl_jax.types import RewardBatch, Transition
 
 def transition(*leading):
     leaves = (*leading, 3), (*leading, 2), leading, (*leading, 3), leading
-    return Transition(*map(np.zeros, leaves))
+    return Transition(*map(np.zeros, leaves))._replace(terminated=np.zeros(leading, bool))
 
 
 def batch(*leading):

@@ -1,8 +1,12 @@
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from cmedirl_jax import checks
-from cmedirl_jax.types import Transition
+from cmedirl_jax import checks, composition, ddpg, hot_start, irl, replay, tabular
+from cmedirl_jax.demonstrations import DemonstrationSubset
+from cmedirl_jax.methods import METHODS, Settings
+from cmedirl_jax.types import RewardBatch, Transition
 
 
 def transition(spec, *leading):
@@ -28,3 +32,238 @@ def test_any_leaf_of_another_shape_is_refused_with_both_shapes(skewed_spec, fiel
 def test_other_leading_axes_are_refused(skewed_spec):
     with pytest.raises(ValueError, match="batch: expected"):
         checks.transition_shapes(skewed_spec, transition(skewed_spec, 4), (5,), "batch")
+
+
+@pytest.mark.parametrize("field", Transition._fields)
+def test_any_leaf_of_another_dtype_is_refused_by_name(skewed_spec, field):
+    given = transition(skewed_spec, 4)
+    wrong = given._replace(**{field: getattr(given, field).astype(int)})
+    with pytest.raises(TypeError, match=rf"batch: {field}: expected .*, got int32"):
+        checks.transition_shapes(skewed_spec, wrong, (4,), "batch")
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"observation_dim": 0}, "observation_dim must be at least 1, got 0"),
+        ({"action_dim": -1}, "action_dim must be at least 1, got -1"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, got 0"),
+        ({"observation_dim": 2}, r"observation_low: expected shape \(2,\), got \(3,\)"),
+        ({"action_high": np.float32(1.0)}, r"action_high: expected shape \(2,\), got \(\)"),
+        ({"action_low": np.array([-np.inf, 0.5])}, "action bounds must be finite"),
+        ({"action_high": np.array([3.0, np.nan])}, "action bounds must be finite"),
+        ({"action_low": np.array([-1.0, 1.0])}, "action_low must be below action_high"),
+        ({"observation_low": np.array([-1.0, 0.0, 11.0])}, "observation_low must be below"),
+        ({"observation_high": np.array([3.0, np.nan, 10.0])}, "observation_low must be below"),
+    ],
+)
+def test_a_specification_that_contradicts_itself_is_refused(skewed_spec, change, named):
+    checks.env_spec(skewed_spec)
+    wrong = skewed_spec._replace(**change)
+    for refuse in (checks.env_spec, ddpg.make, irl.make, irl.adversarial.make):
+        with pytest.raises(ValueError, match=rf"^Skewed-v0: .*{named}"):
+            refuse(wrong)
+    with pytest.raises(ValueError, match=named):
+        composition.compose(wrong, METHODS["ddpg"], Settings(), capacity=10)
+
+
+def test_observations_without_bounds_agree_with_themselves(skewed_spec):
+    infinite = np.full(3, np.inf)
+    checks.env_spec(skewed_spec._replace(observation_low=-infinite, observation_high=infinite))
+
+
+STATES, ACTIONS, HORIZON, SUCCESSORS = 4, 3, 5, 2
+
+
+def public_functions(spec):
+    """Of each public function that takes arrays: a call by their names, and right ones."""
+    agent, buffer = ddpg.make(spec), replay.make(spec, 10)
+    learners = {
+        "irl": irl.make(spec),
+        "trajectories": irl.make(spec, irl.IRLHParams(objective="trajectory")),
+        "gail": irl.adversarial.make(spec),
+        "random": irl.controls.random(spec),
+    }
+    key = jax.random.key(0)
+    agent_state = jax.eval_shape(agent.init, key)
+    states = {name: jax.eval_shape(learner.init, key) for name, learner in learners.items()}
+    seen = {"observation": jnp.zeros((6, 3)), "action": jnp.zeros((6, 2))}
+    batch, one = transition(spec, 6)._asdict(), transition(spec)._asdict()
+    steps, rest = transition(spec, 2, 6), transition(spec, 6)
+
+    def of_params(function, given):
+        return lambda **arrays: jax.eval_shape(lambda state: function(state, arrays), given)
+
+    def hot_start_fit(**arrays):
+        length = arrays.pop("length")
+        returns = arrays.pop("discounted_return")
+        subset = DemonstrationSubset(jnp.zeros(2, jnp.int32), length)
+        data = hot_start.HotStartData(Transition(**arrays), returns, subset)
+        return jax.eval_shape(
+            lambda state: hot_start.fit(
+                key,
+                agent.networks,
+                (state.actor, state.critic),
+                data,
+                hot_start.HotStartHParams(steps=1),
+            ),
+            agent_state,
+        )
+
+    calls = {
+        "act": (
+            of_params(lambda state, arrays: agent.act(state, **arrays), agent_state),
+            {"observation": seen["observation"]},
+        ),
+        "value": (of_params(lambda state, arrays: agent.value(state, **arrays), agent_state), seen),
+        "agent.update": (
+            of_params(lambda state, arrays: agent.update(state, Transition(**arrays)), agent_state),
+            batch,
+        ),
+        "cloning": (
+            of_params(
+                lambda state, arrays: agent.update(state, rest, Transition(**arrays)), agent_state
+            ),
+            batch,
+        ),
+        "replay.add": (
+            lambda **arrays: jax.eval_shape(
+                lambda: buffer.add(buffer.init(), Transition(**arrays))
+            ),
+            one,
+        ),
+        "hot_start.fit": (
+            hot_start_fit,
+            batch | {"discounted_return": jnp.zeros(6), "length": jnp.ones(2, jnp.int32)},
+        ),
+    }
+    for name, learner in learners.items():
+        calls[f"{name}.reward"] = (
+            of_params(
+                lambda state, arrays, learner=learner: learner.reward(state, **arrays), states[name]
+            ),
+            seen,
+        )
+        if name != "random":
+            whole = steps if name == "trajectories" else rest
+            leading = whole.reward.shape
+            given = {
+                name: leaf
+                for name, leaf in whole._asdict().items()
+                if name in ("observation", "action", "terminated")
+            } | {"log_density": jnp.zeros(leading[0]), "mask": jnp.ones(leading, bool)}
+
+            def update(state, arrays, learner=learner, whole=whole):
+                arrays = dict(arrays)
+                rest = {name: arrays.pop(name) for name in ("log_density", "mask")}
+                return learner.update(state, whole, RewardBatch(whole._replace(**arrays), **rest))
+
+            calls[f"{name}.update"] = of_params(update, states[name]), given
+    return calls
+
+
+def tabular_functions():
+    dense = {"dynamics": jnp.full((STATES, ACTIONS, STATES), 1 / STATES)}
+    sparse = {
+        "next_state": jnp.zeros((STATES, ACTIONS, SUCCESSORS), jnp.int32),
+        "probability": jnp.full((STATES, ACTIONS, SUCCESSORS), 1 / SUCCESSORS),
+    }
+    of_states = {"absorbing": jnp.zeros(STATES, bool), "guess": jnp.zeros(STATES)}
+    reward = {"reward": jnp.zeros((STATES, ACTIONS))}
+
+    def abstract(function):
+        return lambda **arrays: jax.eval_shape(lambda: function(**arrays))
+
+    def sparsely(next_state, probability, **arrays):
+        dynamics = tabular.SparseDynamics(next_state, probability)
+        return tabular.soft_value_iteration(dynamics, discount=0.9, **arrays)
+
+    def visits(dynamics, log_probabilities, **arrays):
+        zeros = jnp.zeros(())
+        policy = tabular.SoftPolicy(log_probabilities, zeros, zeros, zeros)
+        return tabular.expected_visitation(dynamics, policy, discount=0.9, **arrays)
+
+    def fit(dynamics, features, visitation, initial, absorbing):
+        demonstrations = tabular.TabularDemonstrations(visitation, initial)
+        return tabular.maxent_irl(
+            dynamics, features, demonstrations, discount=0.9, absorbing=absorbing, steps=1
+        )
+
+    found = {
+        "visitation": jnp.zeros((STATES, ACTIONS)),
+        "initial": jnp.full(STATES, 1 / STATES),
+        "absorbing": of_states["absorbing"],
+    }
+    return {
+        "soft": (
+            abstract(lambda **a: tabular.soft_value_iteration(discount=0.9, **a)),
+            dense | reward | of_states,
+        ),
+        "soft, sparse": (abstract(sparsely), sparse | reward | of_states),
+        "hard": (
+            abstract(lambda **a: tabular.value_iteration(discount=0.9, **a)),
+            dense | reward | {"absorbing": of_states["absorbing"]},
+        ),
+        "visitation": (
+            abstract(visits),
+            dense
+            | of_states
+            | {"log_probabilities": jnp.zeros((STATES, ACTIONS)), "initial": found["initial"]},
+        ),
+        "maxent": (abstract(fit), dense | found | {"features": jnp.zeros((STATES, ACTIONS, 7))}),
+    }
+
+
+def wrong_arrays(name, array):
+    """Arrays that are not `array`'s shape, or not its kind."""
+    if array.ndim:
+        yield array[0]
+        yield jnp.concatenate([array, array[:1]])
+    yield array[None]
+    yield array[..., None]
+    if name not in ("log_density", "length", "discounted_return", "log_probabilities"):
+        yield array.astype(jnp.float32 if not jnp.issubdtype(array.dtype, jnp.floating) else int)
+
+
+def test_public_functions_take_right_arrays_and_refuse_every_other_by_shape_or_dtype(skewed_spec):
+    refusals = 0
+    for function, (call, right) in (public_functions(skewed_spec) | tabular_functions()).items():
+        call(**right)
+        for name, array in right.items():
+            for wrong in wrong_arrays(name, array):
+                if function == "act" and wrong.shape[-1:] == (3,) and wrong.dtype == array.dtype:
+                    continue  # Any leading axes are right.
+                said = f"{function}({name}={wrong.dtype}{wrong.shape}): "
+                try:
+                    call(**right | {name: wrong})
+                except (ValueError, TypeError) as error:
+                    said += str(error)
+                _, message = said.split(": ", 1)
+                assert str(wrong.shape) in message or str(wrong.dtype) in message, said
+                refusals += 1
+    assert refusals > 300
+
+
+def test_shapes_under_vmap_are_those_of_one_seed(skewed_spec):
+    agent = ddpg.make(skewed_spec)
+    states = jax.eval_shape(jax.vmap(agent.init), jax.random.split(jax.random.key(0), 5))
+    batch = jax.eval_shape(lambda: transition(skewed_spec, 5, 6))
+    jax.eval_shape(jax.vmap(agent.update), states, batch)
+    wrong = jax.ShapeDtypeStruct((5, 7), jnp.float32)
+    with pytest.raises(ValueError, match="batch: expected leaves"):
+        jax.eval_shape(jax.vmap(agent.update), states, batch._replace(reward=wrong))
+
+
+@pytest.mark.parametrize("size", ["cells", "steps", "batch_size"])
+def test_a_hot_start_of_no_size_is_refused(skewed_spec, size):
+    networks = ddpg.make(skewed_spec).networks
+    with pytest.raises(ValueError, match=f"{size} must be at least 1, got 0"):
+        hot_start.fit(
+            jax.random.key(0), networks, ({}, {}), None, hot_start.HotStartHParams(**{size: 0})
+        )
+
+
+@pytest.mark.parametrize("solve", [tabular.soft_value_iteration, tabular.value_iteration])
+def test_a_horizon_of_no_step_is_refused(solve):
+    with pytest.raises(ValueError, match="horizon must be at least 1, got 0"):
+        solve(np.full((2, 2, 2), 0.5), np.zeros((2, 2)), discount=1.0, horizon=0)

@@ -1,14 +1,17 @@
 import dataclasses
 import json
+import math
 
 import numpy as np
 import polars as pl
 import pytest
 import scipy.stats
+from hypothesis import given, settings
 
 from experiments import compare, results
 from experiments.errors import UserError
 from experiments.presets import PRESETS
+from tests import damages
 
 STEPS = np.array([0, 100, 200])
 SEEDS = 6
@@ -52,6 +55,16 @@ def folder(tmp_path):
     results.append(tmp_path, cell("c", 5, [slow] * SEEDS))
     results.append(tmp_path, cell("never-acts", 5, [[95]] * SEEDS))
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A run of two cells, which no test changes for the others."""
+    folder = tmp_path_factory.mktemp("small")
+    write_config(folder)
+    for method, n_demos in (("a", 0), ("b", 5)):
+        results.append(folder, cell(method, n_demos, [[0, 20, 95]] * SEEDS))
+    return folder
 
 
 def test_differences_are_of_pairs_of_seeds(folder):
@@ -141,3 +154,56 @@ def test_mistakes_are_refused_in_a_line(folder, arguments, named, capsys):
     error = capsys.readouterr().err
     assert named in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["config.json", "evaluations.parquet", "seeds.parquet"])
+@settings(max_examples=50)
+@given(damage=damages.damages())
+def test_a_damaged_file_of_a_run_is_a_users_error_or_harmless(small, name, damage):
+    with damages.done_to(small / name, damage):
+        table, refusal = damages.attempt(UserError, compare.compare, small, "a")
+    if refusal is not None:
+        assert str(small) in refusal
+        assert "\n" not in refusal
+    else:
+        assert set(table["measure"]) == set(compare.MEASURES)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("config.json", b""),
+        ("config.json", b"[" * 100_000),
+        ("config.json", b'{"config": []}'),
+        ("config.json", b'{"config": {"max_episodes": null, "seeds": "many"}}'),
+        ("evaluations.parquet", b"PAR1"),
+        ("evaluations.parquet", pl.DataFrame({"another": [1]})),
+        ("evaluations.parquet", pl.DataFrame({"method": ["a"], "n_demos": [0]})),
+        ("seeds.parquet", pl.DataFrame({"method": ["a"], "n_demos": [0]})),
+        ("seeds.parquet", None),
+    ],
+)
+def test_a_run_of_other_files_is_refused_in_a_line(small, name, content, capsys):
+    path, whole = small / name, (small / name).read_bytes()
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is None:
+        path.unlink()
+    else:
+        content.write_parquet(path)
+    assert compare.main([str(small), "--against", "a"]) == 2
+    path.write_bytes(whole)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(f"compare: {small}: holds a damaged file (")
+    assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("curves", [[[0, 1, 2]] * (SEEDS - 1), [[0, math.nan, 2]] * SEEDS])
+def test_cells_of_fewer_seeds_or_undefined_returns_are_refused(small, curves):
+    whole = {path: path.read_bytes() for path in small.iterdir()}
+    results.append(small, cell("c", 5, curves))
+    with pytest.raises(UserError, match=f"c has no finite returns of {SEEDS} seeds"):
+        compare.compare(small, "a")
+    for path, content in whole.items():
+        path.write_bytes(content)

@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import polars as pl
 import pytest
+from hypothesis import given, settings
 from polars.testing import assert_frame_equal
 
 from cmedirl_jax.irl import IRLHParams
@@ -13,6 +14,7 @@ from cmedirl_jax.methods import Settings
 from experiments import results
 from experiments.errors import UserError
 from experiments.presets import PRESETS, Grid
+from tests import damages
 
 
 @pytest.fixture
@@ -101,6 +103,8 @@ def test_the_folders_spelling_and_the_devices_are_not_compared(grid, monkeypatch
         b"{",
         b"\xff",
         b"[]",
+        b"[" * 100_000,
+        b'{"config": {}}',
         b'{"schema": 1}',
         b'{"schema": 1, "config": []}',
         b'{"schema": 2, "config": {}}',
@@ -225,3 +229,33 @@ def test_a_missing_table_is_a_users_error(tmp_path):
     (tmp_path / "seeds.parquet").unlink()
     with pytest.raises(UserError, match="damaged table"):
         results.finished(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run's folder, and its configuration."""
+    grid = Grid(out=tmp_path_factory.mktemp("whole"))
+    results.append(results.open_folder(grid), cell("ddpg", 0))
+    return grid
+
+
+@settings(max_examples=100)
+@given(damage=damages.damages())
+def test_a_damaged_configuration_is_a_users_error_or_harmless(whole, damage):
+    with damages.done_to(whole.folder / "config.json", damage):
+        _, refusal = damages.attempt(UserError, results.check_folder, whole)
+    assert refusal is None or refusal.startswith("--out: ")
+    assert "\n" not in str(refusal)
+
+
+@pytest.mark.parametrize("table", results.TABLES)
+@settings(max_examples=60)
+@given(damage=damages.damages())
+def test_a_table_damaged_anywhere_is_a_users_error_or_read(whole, table, damage):
+    with damages.done_to(whole.folder / f"{table}.parquet", damage):
+        found, refusal = damages.attempt(UserError, results.finished, whole.folder)
+    if refusal is None:
+        assert all(isinstance(name, str | None) for name, _ in found)
+    else:
+        assert refusal.startswith("--out: ")
+        assert "\n" not in refusal

@@ -68,11 +68,11 @@ def refused(main, tmp_path, capsys):
     [
         (
             "--methods maxent-irl --tabular.states 1",
-            "--tabular: a grid needs two points along each dimension, got (1, 1)",
+            "--tabular.states: must be at least 2, got 1",
         ),
         (
             "--methods maxent-irl --tabular.centres 1",
-            "--tabular: radial basis functions need two centres or more, got 1",
+            "--tabular.centres: must be at least 2, got 1",
         ),
         ("--tabular.steps 0", "--tabular.steps: must be at least 1, got 0"),
         (
@@ -99,7 +99,18 @@ def refused(main, tmp_path, capsys):
         ),
         ("--max-steps None", "--max-steps: give a number, or give --max-episodes"),
         ("--seed -1", "--seed: must be between 0 and 2^32 - 1, got -1"),
-        ("--demos none.npz", "--demos: there is no file none.npz"),
+        (
+            "--demos none.npz",
+            "--demos: there is no file none.npz; give one that demonstrations.save wrote",
+        ),
+        (
+            "--demos D4RL/door/human-v2",
+            "--demos: there is no file D4RL/door/human-v2; give one that demonstrations.save wrote",
+        ),
+        (
+            f"--max-steps None --max-episodes {2**31 - 1}",
+            f"--max-episodes: makes {999 * (2**31 - 1)} steps, more than 2^31 - 1",
+        ),
     ],
 )
 def test_what_cannot_work_is_refused_in_a_line(refused, arguments, line):
@@ -165,29 +176,42 @@ def test_more_demonstrations_than_the_file_holds_are_refused(refused, demos):
 @pytest.mark.parametrize(
     "damage",
     [
+        "empty",
         "garbage",
         "cut short",
         "foreign",
+        "pickle",
         "another environment",
+        "undefined",
+        "out of bounds",
+        "folder",
+        "pipe",
     ],
 )
 def test_a_demonstrations_file_that_cannot_be_used_is_refused(refused, demos, damage):
     match damage:
+        case "empty":
+            demos.write_bytes(b"")
         case "garbage":
             demos.write_bytes(b"garbage")
         case "cut short":
             demos.write_bytes(demos.read_bytes()[:-100])
+        case "pickle":
+            np.savez(demos, allow_pickle=True, header=np.array([{}], dtype=object))
+        case "undefined" | "out of bounds":
+            with np.load(demos) as file:
+                arrays = dict(file)
+            arrays["action"][5] = np.nan if damage == "undefined" else 2.0
+            np.savez(demos, **arrays)
+        case "folder" | "pipe":
+            demos.unlink()
+            (demos.mkdir if damage == "folder" else lambda: os.mkfifo(demos))()
         case "foreign":
             np.savez(demos, observation=np.zeros(3))
         case "another environment":
             pool = pools.scripted(3)._replace(metadata={"env": "Pendulum-v1"})
             demonstrations.save(demos, pool)
     assert refused("--demos", demos, "--n-demos", 1).startswith(f"--demos: {demos}: ")
-
-
-def test_a_folder_in_the_place_of_the_demonstrations_file_is_refused(refused, tmp_path):
-    (tmp_path / "demos").mkdir()
-    assert refused("--demos", "demos").startswith("--demos: ")
 
 
 @pytest.mark.parametrize("out", ["file", "file/run"])

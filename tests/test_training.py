@@ -19,6 +19,9 @@ def test_fit_trains_and_evaluates_all_seeds():
     assert result.states.episode.tolist() == [1, 1, 1]
     with pytest.raises(ValueError, match="unknown method 'sarsa'; there are: ddpg"):
         fit(jax.random.key(0), ENV, "sarsa")
+    elsewhere = pool._replace(metadata={"env": "Pendulum-v1"})
+    with pytest.raises(ValueError, match="made for environment 'Pendulum-v1'"):
+        fit(jax.random.key(0), ENV, "hs-ddpg", elsewhere)
     with pytest.raises(ValueError, match="needs demonstrations"):
         fit(jax.random.key(0), ENV, "me-ddpg")
     with pytest.raises(ValueError, match="multiple of evaluate_every"):

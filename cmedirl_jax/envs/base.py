@@ -4,7 +4,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 
+from cmedirl_jax import checks
 from cmedirl_jax.types import EnvSpec
 
 
@@ -62,3 +64,55 @@ class Env(NamedTuple):
     step: StepFn
     starts: Callable[[int, Any], tuple[Any, jax.Array]]
     state_at: Callable[[jax.Array, Any], Any] | None = None
+
+
+def check(env: Env, params: Any = None) -> None:
+    """Check an environment's specification, and that its functions keep to it. Nothing is run.
+
+    Args:
+        env: the environment.
+        params: its parameters, default `env.default_params`.
+
+    Raises:
+        ValueError: naming what has another shape, or another structure.
+        TypeError: naming what has another dtype.
+    """
+    spec = env.spec
+    checks.env_spec(spec)
+    params = env.default_params if params is None else params
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    action = jax.ShapeDtypeStruct((spec.action_dim,), jnp.float32)
+
+    def same(name: str, found: Any, expected: Any) -> None:
+        leaves = [[(x.shape, x.dtype) for x in jax.tree.leaves(tree)] for tree in (found, expected)]
+        if leaves[0] != leaves[1] or jax.tree.structure(found) != jax.tree.structure(expected):
+            raise ValueError(f"{spec.id}: {name} is not of reset's kind: {found}, not {expected}")
+
+    def observations(name: str, found: Any, *leading: int) -> None:
+        name = f"{spec.id}: observation of {name}"
+        checks.shape(name, found, (*leading, spec.observation_dim))
+        checks.kind(name, found, jnp.floating)
+
+    state, observation = jax.eval_shape(lambda key: env.reset(key, params), key)
+    observations("reset", observation)
+    after, step = jax.eval_shape(
+        lambda key, state, action: env.step(key, state, action, params), key, state, action
+    )
+    same("state after a step", after, state)
+    observations("step", step.observation)
+    for name, kind in (
+        ("reward", jnp.floating),
+        ("terminated", jnp.bool_),
+        ("truncated", jnp.bool_),
+    ):
+        checks.shape(f"{spec.id}: {name}", getattr(step, name), ())
+        checks.kind(f"{spec.id}: {name}", getattr(step, name), kind)
+    count = 2
+    states, start_observations = jax.eval_shape(lambda: env.starts(count, params))
+    observations("starts", start_observations, count)
+    first = jax.eval_shape(lambda states: jax.tree.map(lambda leaf: leaf[0], states), states)
+    same("a state of starts", first, state)
+    if env.state_at is not None:
+        state_at = env.state_at
+        of_observation = jax.eval_shape(lambda seen: state_at(seen, params), observation)
+        same("state_at", of_observation, state)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import optimizers, rewards
+from cmedirl_jax import checks, optimizers, rewards
 from cmedirl_jax.hparams import traced
 from cmedirl_jax.irl import base, regularisers
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
@@ -48,7 +48,11 @@ def make(
         hparams: the initial hyperparameters.
         network: f(s, a), the discriminator's logit, default `rewards.mlp(spec)`.
         optimizer: default Adam at `state.hparams.learning_rate`.
+
+    Raises:
+        ValueError: if the specification does not agree with itself.
     """
+    checks.env_spec(spec)
     hparams = hparams or GAILHParams()
     network = network or rewards.mlp(spec)
     tx = optax.with_extra_args_support(optimizer or optimizers.adam())
@@ -67,6 +71,7 @@ def make(
                 return hparams.scale * logit
 
     def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
+        checks.pairs(spec, observation, action)
         return of_logit(network.apply(state.params, observation, action), state.hparams)
 
     def update(

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from cmedirl_jax import checks
 from cmedirl_jax.types import EnvSpec, Params, RewardBatch, Transition
 
 
@@ -66,6 +67,7 @@ class UpdateFn(Protocol):
 
         Raises:
             ValueError: if a batch is not of the shapes that the learner takes, or `key` is missing.
+            TypeError: if a leaf is not of floats, or `terminated` or the mask not bool.
         """
         ...
 
@@ -75,7 +77,8 @@ class RewardLearner(NamedTuple):
 
     Attributes:
         init: `(key) -> RewardState`.
-        reward: `(state, observation [..., O], action [..., A]) -> [...]`, r_D(s, a; theta).
+        reward: `(state, observation [..., O], action [..., A]) -> [...]`, r_D(s, a; theta). While
+            tracing it raises ValueError for other shapes and TypeError for other dtypes.
         update: see `UpdateFn`.
         absorbing: `(state) -> []`, r_D of the absorbing state that follows termination; None where
             nothing follows it.
@@ -109,6 +112,7 @@ def pairs(spec: EnvSpec, batch: Transition | RewardBatch, name: str) -> RewardBa
 
     Raises:
         ValueError: if it is not of shapes `[B, O]`, `[B, A]` and `[B]`.
+        TypeError: if a leaf is not of floats, or `terminated` or the mask not bool.
     """
     return _checked(spec, batch, name, ("B",))
 
@@ -118,6 +122,7 @@ def trajectories(spec: EnvSpec, batch: Transition | RewardBatch, name: str) -> R
 
     Raises:
         ValueError: if it is not of shapes `[M, T, O]`, `[M, T, A]`, `[M, T]` and `[M]`.
+        TypeError: if a leaf is not of floats, or `terminated` or the mask not bool.
     """
     return _checked(spec, batch, name, ("M", "T"))
 
@@ -144,4 +149,6 @@ def _checked(
                 f"{name}: expected {what} [{', '.join(map(str, wanted))}] beside observations "
                 f"{jnp.shape(transition.observation)}, got {jnp.shape(leaf)}"
             )
+        logical = what in ("terminated", "mask")
+        checks.kind(f"{name}: {what}", leaf, jnp.bool_ if logical else jnp.floating)
     return batch

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import rewards
+from cmedirl_jax import checks, rewards
 from cmedirl_jax.hparams import traced
 from cmedirl_jax.irl import base, regularisers
 from cmedirl_jax.irl.base import RewardLearner, RewardState
@@ -72,6 +72,7 @@ def random(
         return RewardState(standardised, (), traced(hparams))
 
     def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
+        checks.pairs(spec, observation, action)
         params, mean, deviation = state.params
         output = (network.apply(params, observation, action) - mean) / deviation
         return regularisers.bounded(output, state.hparams.bound)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cmedirl_jax import optimizers, rewards
+from cmedirl_jax import checks, optimizers, rewards
 from cmedirl_jax.hparams import traced
 from cmedirl_jax.irl import base, objectives, regularisers
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
@@ -98,7 +98,11 @@ def make(
         network: f(s, a), default `rewards.mlp(spec)`.
         optimizer: default Adam at `state.hparams.learning_rate`; it is handed the gradient of the
             *negative* posterior, to descend.
+
+    Raises:
+        ValueError: if the specification does not agree with itself.
     """
+    checks.env_spec(spec)
     hparams = hparams or IRLHParams()
     network = network or rewards.mlp(spec)
     tx = optax.with_extra_args_support(optimizer or optimizers.adam())
@@ -115,6 +119,7 @@ def make(
         return regularisers.bounded(output, hparams.bound, hparams.bounded_by)
 
     def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
+        checks.pairs(spec, observation, action)
         output = network.apply(state.params.network, observation, action)
         return bounded(output, state.hparams) - state.params.offset
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import checks
 from cmedirl_jax.types import Array
 
 
@@ -39,11 +40,17 @@ def next_distribution(dynamics: Dynamics, visits: jax.Array) -> jax.Array:
     return jnp.einsum("sa,sat->t", visits, dynamics)
 
 
-def check(dynamics: Dynamics, state_actions: tuple[int, ...]) -> None:
-    """Refuse dynamics that are not of `state_actions`, (S, A).
+def check(dynamics: Dynamics, state_actions: tuple[int, ...], **of_states: Array | None) -> None:
+    """Refuse dynamics that are not of `state_actions`, (S, A), and other arrays that are not `[S]`.
+
+    Args:
+        dynamics: P(s'|s,a).
+        state_actions: the reward's shape.
+        of_states: further arrays by name: `absorbing` is to be bool, the others of floats.
 
     Raises:
-        ValueError: with both shapes.
+        ValueError: with the shapes.
+        TypeError: for other dtypes.
     """
     if isinstance(dynamics, SparseDynamics):
         shapes = (jnp.shape(dynamics.next_state), jnp.shape(dynamics.probability))
@@ -56,3 +63,22 @@ def check(dynamics: Dynamics, state_actions: tuple[int, ...]) -> None:
             f"expected a reward [S, A] and dynamics [S, A, S] or two arrays [S, A, K], "
             f"got {state_actions} and {shapes}"
         )
+    if isinstance(dynamics, SparseDynamics):
+        checks.kind("next_state", dynamics.next_state, jnp.integer)
+        checks.kind("probability", dynamics.probability, jnp.floating)
+    else:
+        checks.kind("dynamics", dynamics, jnp.floating)
+    for name, array in of_states.items():
+        if array is not None:
+            checks.shape(name, array, state_actions[:1])
+            checks.kind(name, array, jnp.bool_ if name == "absorbing" else jnp.floating)
+
+
+def check_horizon(horizon: int | None) -> None:
+    """Refuse a horizon of no step.
+
+    Raises:
+        ValueError: with the horizon.
+    """
+    if horizon is not None:
+        checks.sizes(horizon=horizon)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import checks
 from cmedirl_jax.hparams import traced
 from cmedirl_jax.irl import IRLHParams, RewardLearner, RewardState, base
 from cmedirl_jax.tabular import interpolation
@@ -24,6 +25,8 @@ def make(states: Grid, actions: Grid, hparams: IRLHParams | None = None) -> Rewa
         return state(jnp.zeros((states.size, actions.size)), hparams)
 
     def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
+        checks.shape("observation", observation, (*observation.shape[:-1], len(states.shape)))
+        checks.shape("action", action, (*observation.shape[:-1], len(actions.shape)))
         row, row_weight = interpolation.interpolate(states, observation)
         column, column_weight = interpolation.interpolate(actions, action)
         values = state.params[row[..., :, None], column[..., None, :]]

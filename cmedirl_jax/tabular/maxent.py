@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from cmedirl_jax import checks
+from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import soft_control
 from cmedirl_jax.tabular.dynamics import Dynamics
 from cmedirl_jax.tabular.fixed_point import Stop
@@ -102,9 +104,16 @@ def maxent_irl(
         stop: of the fixed points, without a horizon.
 
     Raises:
-        ValueError: if the shapes do not fit each other.
+        ValueError: if the shapes do not fit each other, or a size is not positive.
+        TypeError: for other dtypes.
     """
-    features = jnp.asarray(features)
+    features, size = jnp.asarray(features), jnp.shape(demonstrations.visitation)
+    checks.kind("features", features, jnp.floating)
+    if features.ndim < 2 or features.shape[:-1] not in (size[:1], size):
+        raise ValueError(
+            f"expected features [S, F] or [S, A, F] beside a visitation {size}, "
+            f"got {features.shape}"
+        )
     linear = Network(
         init=lambda key: jnp.zeros(features.shape[-1], features.dtype),
         apply=lambda theta, features: features @ theta,
@@ -149,9 +158,16 @@ def deep_maxent_irl(
         network: `apply(params, *inputs)` gives `[S]` for a reward of states, or `[S, A]`.
         inputs: `(f [S, ...],)`, or `(f [S, A, ...], a [S, A, ...])`.
         dynamics: and all that follows as in `maxent_irl`; the default optimiser is Adam at 0.01.
+
+    Raises:
+        ValueError: if the shapes do not fit each other, or a size is not positive.
+        TypeError: for other dtypes.
     """
+    checks.sizes(steps=steps)
     tx = optax.with_extra_args_support(optimizer or optax.adam(0.01))
     visited, initial = demonstrations
+    dynamics_lib.check(dynamics, jnp.shape(visited), initial=initial, absorbing=absorbing)
+    checks.kind("visitation", visited, jnp.floating)
     shared = {
         "discount": discount,
         "horizon": horizon,
@@ -161,8 +177,13 @@ def deep_maxent_irl(
 
     def of_pairs(params: Params) -> jax.Array:
         reward = network.apply(params, *inputs)
-        if reward.ndim == 1:
+        if reward.shape == visited.shape[:1]:
             reward = reward[:, None]
+        elif reward.shape != visited.shape:
+            raise ValueError(
+                f"a reward of states is {visited.shape[:1]}, or of pairs {visited.shape}, "
+                f"got {reward.shape}"
+            )
         return jnp.broadcast_to(reward, visited.shape)
 
     def solve(reward: jax.Array, guess: jax.Array) -> SoftPolicy:

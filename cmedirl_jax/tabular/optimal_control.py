@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import checks
 from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import fixed_point
 from cmedirl_jax.tabular.dynamics import Dynamics
@@ -39,9 +40,12 @@ def value_iteration(
     """V*(s) = max_a r(s, a) + gamma sum_s' P(s'|s,a) V*(s'); arguments as `soft_value_iteration`.
 
     Raises:
-        ValueError: if the shapes do not fit each other.
+        ValueError: if the shapes do not fit each other, or the horizon is below 1.
+        TypeError: for other dtypes.
     """
-    dynamics_lib.check(dynamics, reward.shape)
+    dynamics_lib.check(dynamics, jnp.shape(reward), absorbing=absorbing)
+    checks.kind("reward", reward, jnp.floating)
+    dynamics_lib.check_horizon(horizon)
 
     def action_values(values: jax.Array) -> jax.Array:
         return reward + discount * dynamics_lib.expected_next(dynamics, values)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import checks
 from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import fixed_point
 from cmedirl_jax.tabular.dynamics import Dynamics
@@ -61,9 +62,12 @@ def soft_value_iteration(
         guess: `[S]`, where that begins; default zeros.
 
     Raises:
-        ValueError: if the shapes do not fit each other.
+        ValueError: if the shapes do not fit each other, or the horizon is below 1.
+        TypeError: for other dtypes.
     """
-    dynamics_lib.check(dynamics, reward.shape)
+    dynamics_lib.check(dynamics, jnp.shape(reward), absorbing=absorbing, guess=guess)
+    checks.kind("reward", reward, jnp.floating)
+    dynamics_lib.check_horizon(horizon)
 
     def back_up(values: jax.Array) -> tuple[jax.Array, jax.Array]:
         q = reward + discount * dynamics_lib.expected_next(dynamics, values)
@@ -113,6 +117,7 @@ def expected_visitation(
 
     Raises:
         ValueError: if the policy is not of that horizon, or the shapes do not fit each other.
+        TypeError: for other dtypes.
     """
     steps = () if horizon is None else (horizon,)
     if policy.log_probabilities.shape != (*steps, *policy.log_probabilities.shape[-2:]):
@@ -120,7 +125,13 @@ def expected_visitation(
             f"a policy of horizon {horizon} has log_probabilities {(*steps, 'S', 'A')}, "
             f"got {policy.log_probabilities.shape}"
         )
-    dynamics_lib.check(dynamics, policy.log_probabilities.shape[-2:])
+    dynamics_lib.check(
+        dynamics,
+        policy.log_probabilities.shape[-2:],
+        initial=initial,
+        absorbing=absorbing,
+        guess=guess,
+    )
     probabilities = jnp.exp(policy.log_probabilities)
     if absorbing is not None:
         probabilities = jnp.where(jnp.asarray(absorbing)[:, None], 0.0, probabilities)
