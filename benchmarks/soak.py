@@ -48,10 +48,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
     growth = growth_per_cell(samples)
     most = max(sample.resident_bytes for sample in samples)
+    middle, *_, last = least_per_cell(samples)[options.cells // 2 :]
     Console().print(
         f"{options.cells * options.seeds:,} seeds: {most / 2**20:.0f} MiB at most, "
         f"{growth / 2**20:+.2f} MiB a cell once a quarter is done; "
-        f"{samples[-1].open_files} open files at the end",
+        f"{middle.open_files} open files half-way, {last.open_files} at the end",
         highlight=False,
     )
     if options.json is not None:
@@ -90,14 +91,18 @@ def watch(options: Options, run: Path) -> tuple[int, list[Sample]]:
 
 
 def growth_per_cell(samples: Sequence[Sample]) -> float:
-    """Slope of the resident bytes over finished cells, once a quarter of the cells is done.
+    """Slope of the resident bytes over finished cells, once a quarter of the cells is done."""
+    least = least_per_cell(samples)
+    late = [sample for sample in least if sample.cells >= least[-1].cells / 4]
+    return float(np.polyfit([s.cells for s in late], [s.resident_bytes for s in late], 1)[0])
 
-    Of each cell the least, so that what one cell needs for a while does not count.
-    """
-    cells = np.array([sample.cells for sample in samples])
-    resident = np.array([sample.resident_bytes for sample in samples])
-    late = [number for number in np.unique(cells) if number >= cells.max() / 4]
-    return float(np.polyfit(late, [resident[cells == number].min() for number in late], 1)[0])
+
+def least_per_cell(samples: Sequence[Sample]) -> list[Sample]:
+    """Of each number of finished cells the least that was held: not what one needs for a while."""
+    by_cell: dict[int, list[Sample]] = {}
+    for sample in samples:
+        by_cell.setdefault(sample.cells, []).append(sample)
+    return [Sample(*map(min, zip(*by_cell[number], strict=True))) for number in sorted(by_cell)]
 
 
 if __name__ == "__main__":

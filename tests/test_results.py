@@ -235,7 +235,8 @@ def test_a_missing_table_is_a_users_error(tmp_path):
 def whole(tmp_path_factory):
     """A run's folder, and its configuration."""
     grid = Grid(out=tmp_path_factory.mktemp("whole"))
-    results.append(results.open_folder(grid), cell("ddpg", 0))
+    with results.opened(grid) as folder:
+        results.append(folder, cell("ddpg", 0))
     return grid
 
 
