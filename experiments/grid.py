@@ -1,4 +1,4 @@
-"""A whole run: demonstrations, then cell after cell, then the summary and the figures."""
+"""A whole run: demonstrations, then cell after cell."""
 
 import contextlib
 import dataclasses
@@ -6,37 +6,34 @@ import functools
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import polars as pl
 from rich.console import Console
 
-from cmedirl_jax import checkpoint, demonstrations, envs, hot_start, seeds
+from cmedirl_jax import checkpoint, demonstrations, envs, hot_start
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
+from cmedirl_jax.hot_start import HotStartData
 from cmedirl_jax.methods import METHODS, Method, Settings
-from cmedirl_jax.networks import Architecture
 from experiments import (
     cells,
     compilation,
+    conclusion,
     distributed,
     experts,
-    figures,
     gymnasium_replay,
     judging,
     planning,
     results,
-    statistics,
     tables,
     tabular_cells,
 )
 from experiments import programs as programs_lib
 from experiments.bookkeeping import Budget
 from experiments.checkpoints import Keeper
-from experiments.errors import UserError
 from experiments.interruption import Interruption
-from experiments.judging import Judge
 from experiments.planning import Cell
 from experiments.presets import Grid
 from experiments.programs import Programs
@@ -59,24 +56,29 @@ class _Session(NamedTuple):
 
     grid: Grid
     env: Env
+    budget: Budget
     keys: Keys
     devices: list[jax.Device]
     console: Console
     interruption: Interruption
+    identity: dict[str, Any]
 
     def keeper(self, name: str) -> Keeper:
         """What saves the training that is called `name`."""
         return Keeper(
             self.grid.folder / "checkpoints" / name,
-            results.identity(self.grid),
+            self.identity,
             every=self.grid.checkpoint_every,
             interruption=self.interruption,
-            say=self.say,
+            say=lambda line: self.console.print(line, highlight=False, soft_wrap=True),
         )
 
-    def say(self, line: str) -> None:
-        """Tell the user."""
-        self.console.print(line, highlight=False, soft_wrap=True)
+
+class _Compiled(NamedTuple):
+    """Programs by method, each compiled once."""
+
+    method: Callable[[Method, Settings], Programs]
+    tabular: Callable[[Method], tabular_cells.Programs]
 
 
 def run(
@@ -94,21 +96,34 @@ def run(
     given = None
     if grid.demos is not None:
         given = distributed.pool_from_writer(lambda: planning.load_demonstrations(grid, env))
-    keys = Keys(*jax.random.split(jax.random.key(grid.seed), 3))
     plan = planning.cells_of(grid)
-    folder = grid.folder
     with contextlib.ExitStack() as stack:
-        distributed.from_writer(lambda: str(stack.enter_context(results.opened(grid))))
-        done = distributed.from_writer(lambda: [list(cell) for cell in results.finished(folder)])
-        todo = [cell for cell in plan if [cell.method.name, cell.n_demos] not in done]
+
+        def enter() -> dict[str, Any]:
+            folder = stack.enter_context(results.opened(grid))
+            return {
+                "finished": [list(cell) for cell in results.finished(folder)],
+                "identity": results.identity(grid),
+                "began": results.other_versions(folder),
+            }
+
+        found = distributed.from_writer(enter)
+        todo = [cell for cell in plan if [cell.method.name, cell.n_demos] not in found["finished"]]
         if todo:
-            session = _Session(grid, env, keys, devices, console, interruption)
             kind = devices[0].platform.upper()
             console.print(f"{grid.seeds} seeds per cell on {len(devices)} {kind} device(s)")
-            for name, version in distributed.from_writer(
-                lambda: results.other_versions(folder)
-            ).items():
-                session.say(f"This run was begun with {name} {version}")
+            for name, version in found["began"].items():
+                console.print(f"This run was begun with {name} {version}", highlight=False)
+            session = _Session(
+                grid,
+                env,
+                planning.budget_of(grid, env),
+                Keys(*jax.random.split(jax.random.key(grid.seed), 3)),
+                devices,
+                console,
+                interruption,
+                found["identity"],
+            )
             with compilation.counted() as cost:
                 _train_cells(session, given, todo)
             console.print(
@@ -118,153 +133,124 @@ def run(
             )
         if not distributed.is_writer():
             return None
-        shutil.rmtree(folder / "checkpoints", ignore_errors=True)
-        return _conclude(grid, env, folder, plan, redraw=bool(todo))
+        shutil.rmtree(grid.folder / "checkpoints", ignore_errors=True)
+        return conclusion.conclude(grid, env, plan, redraw=bool(todo))
 
 
 def _train_cells(session: _Session, given: Demonstrations | None, todo: list[Cell]) -> None:
-    grid, env, keys, devices, console, interruption = session
-    budget = planning.budget_of(grid, env)
-    pool_path = grid.folder / "demonstrations" / "pool.npz"
-    needs_pool = any(cell.n_demos for cell in todo)
+    grid, env, budget = session.grid, session.env, session.budget
     pool = given
     if pool is None:
-        pool = distributed.pool_from_writer(lambda: _reusable(pool_path, env))
-    trains_experts = needs_pool and pool is None
-    expert_steps = grid.experts.seeds * grid.experts.steps
+        pool = distributed.pool_from_writer(lambda: planning.reusable_demonstrations(grid, env))
+    trains_experts = pool is None and any(cell.n_demos for cell in todo)
     learners = grid.seeds * sum(cell.method.interacts for cell in todo)
-    total = learners * budget.max_steps + expert_steps * trains_experts
-    compile_method = _compiler(grid, env, devices, budget)
-    compile_tabular = functools.cache(
-        functools.partial(
-            tabular_cells.compile_method,
-            env,
-            settings=grid.settings,
-            devices=devices,
-            subset_size=max(grid.n_demos),
-        )
+    total = learners * budget.max_steps + grid.experts.seeds * grid.experts.steps * trains_experts
+    compiled = _Compiled(
+        programs_lib.compiler(grid, env, budget, session.devices),
+        functools.cache(
+            functools.partial(
+                tabular_cells.compile_method,
+                env,
+                settings=grid.settings,
+                devices=session.devices,
+                subset_size=max(grid.n_demos),
+            )
+        ),
     )
-    with reporter(console, len(todo) + trains_experts, total) as report:
+    with reporter(session.console, len(todo) + trains_experts, total) as report:
         if trains_experts:
             report.start(f"experts, {grid.experts.seeds} seeds")
-            pool = experts.make_pool(
-                keys.experts,
-                env,
-                grid.experts,
-                grid.expert,
-                compile_method(METHODS["ddpg"], Settings()),
-                _stepwise(report, grid.experts.seeds),
-                session.keeper("experts"),
-            )
+            pool = _train_experts(session, compiled, report)
         data, metadata = None, {}
         if pool is not None:
             planning.check_enough(grid, int(pool.episode[-1]) + 1)
             agent = grid.settings.agent
             data = hot_start.data(pool, agent.discount, agent.reward_scale)
             metadata = pool.metadata
-        if pool is not None and distributed.is_writer() and not pool_path.exists():
-            pool_path.parent.mkdir(exist_ok=True)
-            demonstrations.save(pool_path, pool)
+        if pool is not None and distributed.is_writer():
+            _keep(pool, planning.pool_path(grid))
         for cell in todo:
-            if interruption.came():
-                interruption.stop()
+            if session.interruption.came():
+                session.interruption.stop()
             report.start(f"{cell.name}, {grid.seeds} seeds")
-            keeper = session.keeper(cell.name)
-            if cell.method.tabular is None or cell.method.interacts:
-                programs = compile_method(cell.method, grid.settings)
-                result = cells.train(
-                    programs,
-                    keys.learners,
-                    data if cell.n_demos else None,
-                    cell.n_demos,
-                    seeds_count=grid.seeds,
-                    budget=budget
-                    if cell.method.interacts
-                    else dataclasses.replace(budget, max_steps=0),
-                    threshold=env.spec.reward_threshold,
-                    report=_stepwise(report, grid.seeds),
-                    keeper=keeper,
-                )
-            else:
-                programs = compile_tabular(cell.method)
-                assert data is not None
-                result = tabular_cells.train(
-                    programs,
-                    keys.learners,
-                    data,
-                    cell.n_demos,
-                    seeds_count=grid.seeds,
-                    evaluation_starts=grid.evaluation_starts,
-                    keeper=keeper,
-                )
-            fresh = programs.judge.on_fresh_starts(result.best, keys.fresh_starts, FRESH_STARTS)
-            rows = tables.rows(
-                result,
-                {
-                    "expert": metadata.get("expert", "file") if cell.n_demos else "none",
-                    "method": cell.method.name,
-                    "n_demos": cell.n_demos,
-                },
-                best_return=judging.summarise(fresh).return_mean,
-                replay=gymnasium_replay.replay(programs.judge, result.best, env),
-                expert_steps=metadata.get("expert_env_steps", 0) if cell.n_demos else 0,
-            )
-            if not distributed.is_writer():
-                continue
-            keeper.wait()
-            save = functools.partial(distributed.alone, checkpoint.save)
-            save(grid.folder / "policies" / cell.name, result.best)
-            if result.reward is not None:
-                save(grid.folder / "rewards" / cell.name, result.reward)
-            results.append(grid.folder, rows)
-            keeper.remove()
+            _train_cell(session, compiled, cell, data, metadata, report)
 
 
-def _compiler(
-    grid: Grid, env: Env, devices: list[jax.Device], budget: Budget
-) -> Callable[[Method, Settings], Programs]:
-    """A function that makes each method's programs once: for all cells, and for the experts too."""
-    seeds_count, capacity = grid.seeds, budget.max_steps
-    if grid.demos is None:
-        seeds_count = max(seeds_count, grid.experts.seeds)
-        capacity = max(capacity, grid.experts.steps)
-
-    def group(architecture: Architecture) -> int:
-        return grid.group or seeds.group_size(grid.seeds, len(devices), architecture.hidden)
-
-    @functools.cache
-    def judge(architecture: Architecture) -> Judge:
-        return judging.of_networks(env, architecture, group(architecture), devices)
-
-    @functools.cache
-    def draw_networks(architecture: Architecture) -> Callable:
-        return programs_lib.compile_networks(env, architecture, group(architecture), devices)
-
-    @functools.cache
-    def compile_method(method: Method, settings: Settings) -> Programs:
-        return programs_lib.compile_method(
-            env,
-            method,
-            settings,
-            judge(settings.architecture),
-            draw_networks(settings.architecture),
-            group=group(settings.architecture),
-            seeds_count=seeds_count,
-            devices=devices,
-            capacity=capacity,
-            subset_size=max(grid.n_demos),
-        )
-
-    return compile_method
+def _train_experts(session: _Session, compiled: _Compiled, report: Reporter) -> Demonstrations:
+    grid = session.grid
+    return experts.make_pool(
+        session.keys.experts,
+        session.env,
+        grid.experts,
+        grid.expert,
+        compiled.method(METHODS["ddpg"], Settings()),
+        _stepwise(report, grid.experts.seeds),
+        session.keeper("experts"),
+    )
 
 
-def _reusable(path: Path, env: Env) -> Demonstrations | None:
+def _keep(pool: Demonstrations, path: Path) -> None:
     if not path.exists():
-        return None
-    try:
-        return demonstrations.load(path, env.spec)
-    except (OSError, ValueError) as error:
-        raise UserError(f"--out: {error}; remove it to train the experts again") from error
+        path.parent.mkdir(exist_ok=True)
+        demonstrations.save(path, pool)
+
+
+def _train_cell(
+    session: _Session,
+    compiled: _Compiled,
+    cell: Cell,
+    data: HotStartData | None,
+    metadata: dict[str, Any],
+    report: Reporter,
+) -> None:
+    """Train a cell, judge its policies, and write what came of it."""
+    grid, env, keys, budget = session.grid, session.env, session.keys, session.budget
+    keeper = session.keeper(cell.name)
+    if cell.method.tabular is None or cell.method.interacts:
+        programs = compiled.method(cell.method, grid.settings)
+        result = cells.train(
+            programs,
+            keys.learners,
+            data if cell.n_demos else None,
+            cell.n_demos,
+            seeds_count=grid.seeds,
+            budget=budget if cell.method.interacts else dataclasses.replace(budget, max_steps=0),
+            threshold=env.spec.reward_threshold,
+            report=_stepwise(report, grid.seeds),
+            keeper=keeper,
+        )
+    else:
+        programs = compiled.tabular(cell.method)
+        assert data is not None
+        result = tabular_cells.train(
+            programs,
+            keys.learners,
+            data,
+            cell.n_demos,
+            seeds_count=grid.seeds,
+            evaluation_starts=grid.evaluation_starts,
+            keeper=keeper,
+        )
+    fresh = programs.judge.on_fresh_starts(result.best, keys.fresh_starts, FRESH_STARTS)
+    rows = tables.rows(
+        result,
+        {
+            "expert": metadata.get("expert", "file") if cell.n_demos else "none",
+            "method": cell.method.name,
+            "n_demos": cell.n_demos,
+        },
+        best_return=judging.summarise(fresh).return_mean,
+        replay=gymnasium_replay.replay(programs.judge, result.best, env),
+        expert_steps=metadata.get("expert_env_steps", 0) if cell.n_demos else 0,
+    )
+    if distributed.is_writer():
+        keeper.wait()
+        save = functools.partial(distributed.alone, checkpoint.save)
+        save(grid.folder / "policies" / cell.name, result.best)
+        if result.reward is not None:
+            save(grid.folder / "rewards" / cell.name, result.reward)
+        results.append(grid.folder, rows)
+        keeper.remove()
 
 
 def _stepwise(report: Reporter, seeds_count: int) -> Callable[[cells.Progress], None]:
@@ -280,47 +266,3 @@ def _stepwise(report: Reporter, seeds_count: int) -> Callable[[cells.Progress], 
         before = progress.env_step
 
     return advance
-
-
-def _conclude(
-    grid: Grid, env: Env, folder: Path, plan: list[Cell], *, redraw: bool
-) -> pl.DataFrame:
-    """Summarise the run's tables; draw its figures where they are not there yet."""
-    loaded = {name: results.read(folder, name) for name in results.TABLES}
-    evaluations, seed_rows, episodes = (
-        loaded[name] for name in ("evaluations", "seeds", "episodes")
-    )
-    assert evaluations is not None
-    assert seed_rows is not None
-    assert episodes is not None
-
-    def of(table: pl.DataFrame, cell: Cell) -> pl.DataFrame:
-        return table.filter(
-            (pl.col("method") == cell.method.name) & (pl.col("n_demos") == cell.n_demos)
-        )
-
-    summary = pl.DataFrame(
-        [
-            statistics.summarise(
-                of(evaluations, cell),
-                of(seed_rows, cell),
-                env.spec.reward_threshold,
-                grid.max_episodes,
-                interacts=cell.method.interacts,
-            )
-            for cell in plan
-        ],
-        infer_schema_length=None,
-    )
-    if redraw or not (folder / "summary.csv").exists():
-        pool_path = folder / "demonstrations" / "pool.npz"
-        expert = None
-        pool = _reusable(pool_path, env)
-        if pool is not None:
-            expert = float(demonstrations.returns(pool).mean())
-        figures.draw(
-            folder / "figures", evaluations, episodes, summary, expert, env.spec.reward_threshold
-        )
-        with results.replacing(folder / "summary.csv") as partial:
-            summary.write_csv(partial)
-    return summary

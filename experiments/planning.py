@@ -1,5 +1,6 @@
 """What a run will do, and whether it can: cells, budget, and every refusal before any work."""
 
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -120,6 +121,26 @@ def load_demonstrations(grid: Grid, env: Env) -> Demonstrations:
         raise UserError(f"--demos: {error}") from error
     check_enough(grid, int(pool.episode[-1]) + 1)
     return pool
+
+
+def pool_path(grid: Grid) -> Path:
+    """Where a run keeps its demonstrations."""
+    return grid.folder / "demonstrations" / "pool.npz"
+
+
+def reusable_demonstrations(grid: Grid, env: Env) -> Demonstrations | None:
+    """Those that the run has already, or None.
+
+    Raises:
+        UserError: if they are damaged.
+    """
+    path = pool_path(grid)
+    if not path.exists():
+        return None
+    try:
+        return demonstrations.load(path, env.spec)
+    except (OSError, ValueError) as error:
+        raise UserError(f"--out: {error}; remove it to train the experts again") from error
 
 
 def check_enough(grid: Grid, held: int) -> None:

@@ -1,5 +1,6 @@
 """The compiled functions of a method, and the lanes of seeds that they step."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,8 +13,11 @@ from cmedirl_jax.hot_start import HotStartData
 from cmedirl_jax.methods import METHODS, Method, Settings
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.training import Log, TrainingState
+from experiments import judging
+from experiments.bookkeeping import Budget
 from experiments.judging import Judge
 from experiments.lanes import Lanes
+from experiments.presets import Grid
 
 
 class Programs(NamedTuple):
@@ -126,3 +130,41 @@ def pack(
     if move is not None:
         state = programs.permute(state, move)
     return state, lanes.groups(active)
+
+
+def compiler(
+    grid: Grid, env: Env, budget: Budget, devices: list[jax.Device]
+) -> Callable[[Method, Settings], Programs]:
+    """A function that makes each method's programs once: for all cells, and for the experts too."""
+    seeds_count, capacity = grid.seeds, budget.max_steps
+    if grid.demos is None:
+        seeds_count = max(seeds_count, grid.experts.seeds)
+        capacity = max(capacity, grid.experts.steps)
+
+    def group(architecture: Architecture) -> int:
+        return grid.group or seeds.group_size(grid.seeds, len(devices), architecture.hidden)
+
+    @functools.cache
+    def judge(architecture: Architecture) -> Judge:
+        return judging.of_networks(env, architecture, group(architecture), devices)
+
+    @functools.cache
+    def draw_networks(architecture: Architecture) -> Callable:
+        return compile_networks(env, architecture, group(architecture), devices)
+
+    @functools.cache
+    def compile_once(method: Method, settings: Settings) -> Programs:
+        return compile_method(
+            env,
+            method,
+            settings,
+            judge(settings.architecture),
+            draw_networks(settings.architecture),
+            group=group(settings.architecture),
+            seeds_count=seeds_count,
+            devices=devices,
+            capacity=capacity,
+            subset_size=max(grid.n_demos),
+        )
+
+    return compile_once
