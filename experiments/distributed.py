@@ -6,6 +6,7 @@ Every process runs the same program on the same values: whatever the host decide
 
 import atexit
 import concurrent.futures
+import dataclasses
 import functools
 import io
 import json
@@ -26,6 +27,7 @@ from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.types import Transition
 from experiments.errors import UserError
 from experiments.presets import Grid
+from experiments.results import NOT_COMPARED
 
 HEARTBEAT_TIMEOUT = 20
 """Seconds after which a process that has fallen silent counts as dead."""
@@ -123,13 +125,28 @@ def guarded(run: Callable[[], int]) -> int:
     try:
         return run()
     except Exception as error:
-        # An ordinary exit would wait for processes that wait for this one.
-        if isinstance(error, jax.errors.JaxRuntimeError) and "Gloo" in str(error):
+        # An ordinary exit would wait for the processes that wait for this one.
+        lost = any(transport in str(error) for transport in ("Gloo", "NCCL", "oordination"))
+        if isinstance(error, jax.errors.JaxRuntimeError) and lost:
             print(GONE, file=sys.stderr, flush=True)
         else:
             traceback.print_exc()
         sys.stdout.flush()
         os._exit(1)
+
+
+def check_same(grid: Grid) -> None:
+    """See that every process was started with the same options. A collective.
+
+    Raises:
+        UserError: on every process, if one was not.
+    """
+    mine = json.loads(json.dumps(dataclasses.asdict(grid), default=str))
+    writers = from_writer(lambda: mine)
+    other = [name for name in mine if name not in NOT_COMPARED and mine[name] != writers[name]]
+    if any_process(bool(other)):
+        here = ", ".join(other) or "another process"
+        raise UserError(f"--process-id: not all processes were given the same options ({here})")
 
 
 def is_writer() -> bool:

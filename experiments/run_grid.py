@@ -93,9 +93,13 @@ def start_devices(grid: Grid) -> list[jax.Device]:
         distributed.join(grid)
     devices = jax.local_devices()
     available = len(devices) if devices[0].platform != "cpu" else cores()
-    if grid.devices is not None and grid.devices > available:
-        raise UserError(f"--devices: {grid.devices} asked, there are {available}")
+    refused = grid.devices is not None and grid.devices > available
+    # Together: a process that left alone would keep the others waiting.
+    if distributed.any_process(refused):
+        there = f"there are {available}" if refused else "another process has fewer"
+        raise UserError(f"--devices: {grid.devices} asked, {there}")
     if distributed.is_asked(grid):
+        distributed.check_same(grid)
         return distributed.devices(grid.devices, grid.seeds)
     return devices[: max(grid.devices, 1)] if grid.devices is not None else devices
 
