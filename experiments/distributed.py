@@ -5,12 +5,12 @@ Every process runs the same program on the same values: whatever the host decide
 """
 
 import atexit
-import concurrent.futures
+import contextlib
 import dataclasses
 import functools
 import io
 import json
-import multiprocessing
+import multiprocessing.connection
 import os
 import signal
 import subprocess
@@ -101,7 +101,7 @@ def join(grid: Grid) -> None:
     Raises:
         UserError: if JAX's cluster detection finds no cluster.
     """
-    _end_after(lambda: os.read(sys.stdin.fileno(), 1))
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     # It would take SIGTERM for itself.
     jax.config.update("jax_enable_preemption_service", False)
     try:
@@ -133,6 +133,11 @@ def guarded(run: Callable[[], int]) -> int:
             traceback.print_exc()
         sys.stdout.flush()
         os._exit(1)
+
+
+def _end_with_parent() -> None:
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)
 
 
 def check_same(grid: Grid) -> None:
@@ -263,35 +268,38 @@ def alone(function: Callable[..., Any], *arguments: Any) -> Any:
     """
     if jax.process_count() == 1:
         return function(*arguments)
-    return _clerk().submit(function, *arguments).result()
+    clerk = _clerk()
+    clerk.send((function, arguments))
+    error, result = clerk.recv()
+    if error is not None:
+        raise error
+    return result
 
 
 @functools.cache
-def _clerk() -> concurrent.futures.Executor:
+def _clerk() -> multiprocessing.connection.Connection:
     spawn = multiprocessing.get_context("spawn")
-    pool = concurrent.futures.ProcessPoolExecutor(1, spawn, _be_clerk)
-    atexit.register(pool.shutdown)
-    return pool
+    mine, clerks = spawn.Pipe()
+    spawn.Process(target=_serve, args=(clerks,)).start()
+    clerks.close()
+    atexit.register(mine.close)
+    return mine
 
 
-def _be_clerk() -> None:
+def _serve(caller: multiprocessing.connection.Connection) -> None:
+    """Call what `caller` sends, until it is gone."""
     jax.config.update("jax_platforms", "cpu")
-    # Whoever stops the run stops its parent, which may still want something saved.
+    # Whoever stops the run stops the caller, who may still want something saved.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    _end_after(parent.join)
-
-
-def _end_after(wait: Callable[[], Any]) -> None:
-    """End this process as soon as `wait`, which a thread calls, returns."""
-
-    def end() -> None:
-        wait()
-        os._exit(1)
-
-    threading.Thread(target=end, daemon=True).start()
+    with contextlib.suppress(EOFError):
+        while True:
+            function, arguments = caller.recv()
+            try:
+                answer = None, function(*arguments)
+            except Exception as error:
+                answer = error, None
+            caller.send(answer)
 
 
 def _from_writer(data: bytes) -> bytes:
