@@ -13,7 +13,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from cmedirl_jax import checkpoint, demonstrations
-from experiments import distributed, results, run_grid
+from experiments import distributed, processes, results, run_grid
 from experiments.errors import UserError
 from tests import compiling, pools
 
@@ -196,7 +196,7 @@ def test_a_dead_process_ends_the_others_and_a_restart_gives_what_one_process_giv
         # The first cell is finished; it dies in the second.
         run.running[1].kill()
         assert run.codes(60) == [1, -signal.SIGKILL]
-        assert run.output(0).splitlines()[-1] == distributed.GONE
+        assert run.output(0).splitlines()[-1] == processes.GONE
         assert "Traceback" not in run.output(0)
     assert not (folder / "summary.csv").exists()
 
@@ -217,7 +217,7 @@ def test_the_death_of_the_writer_ends_the_others_too(together):
         wait_for(run, lambda: "[1/2] me-ddpg-n1" in run.output(0))
         run.running[0].kill()
         assert run.codes(60) == [-signal.SIGKILL, 1]
-        assert distributed.GONE in run.output(1).splitlines()
+        assert processes.GONE in run.output(1).splitlines()
 
 
 def test_processes_that_a_cluster_starts_find_each_other_and_refuse_together(compiled, tmp_path):
