@@ -26,8 +26,7 @@ PACKAGES = ("jax", "jaxlib", "flax", "optax", "chex", "gymnasium", "numpy", "orb
 TABLES = ("seeds", "episodes", "evaluations")
 """In the order they are written."""
 
-NOT_COMPARED = ("out", "devices", "distributed", "coordinator", "processes", "process_id")
-"""Options that are not part of a run's configuration: its values do not depend on them."""
+_NOT_COMPARED = ("out", "devices", "distributed", "coordinator", "processes", "process_id")
 
 
 def describe(grid: Grid) -> dict[str, Any]:
@@ -91,7 +90,7 @@ def _compare(path: Path, config: dict[str, Any]) -> None:
         raise UserError(f"--out: {path} has schema {schema!r}, this version writes {SCHEMA}")
     now = _flat(config)
     for name in sorted(before.keys() | now.keys()):
-        if name not in NOT_COMPARED and before.get(name) != now.get(name):
+        if name not in _NOT_COMPARED and before.get(name) != now.get(name):
             raise UserError(
                 f"--out: {path.parent} holds a run with {_option(name)} {before.get(name)}, not "
                 f"{now.get(name)}; choose another folder or the same configuration"
