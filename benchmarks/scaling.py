@@ -17,7 +17,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from benchmarks import measuring
 from cmedirl_jax import envs, seeds
@@ -26,6 +25,7 @@ from experiments import cells, distributed, judging
 
 GROUPS = {"1 process x 2 devices": (1, 2), "2 processes x 1 device": (2, 1), "its share": (1, 1)}
 """Processes, and devices of each."""
+PAIR = list(GROUPS)[:2]
 EXTRA_FLOATS = (2**12, 2**14, 2**16)
 """Sizes of further arrays that are gathered, per seed, to tell latency from bandwidth."""
 
@@ -42,15 +42,23 @@ def main() -> None:
     if options.worker is not None:
         work(**options.worker)
         return
-    measured = measure(options.method, options.seeds, options.rounds)
-    result = measuring.heading("scaling") | {"method": options.method, "groups": measured}
-    print(json.dumps(result, indent=1))
+    found = measure(options.method, options.seeds, options.rounds)
+    one, two = ([turn["chunk_s"] + turn["gather_s"] for turn in found[name]] for name in PAIR)
+    ratios = sorted(a / b for a, b in zip(one, two, strict=True))
+    result = measuring.heading("scaling") | {
+        "method": options.method,
+        "seeds": options.seeds,
+        "two_processes_rate_over_one": [statistics.median(ratios), ratios[0], ratios[-1]],
+        "medians": {name: medians(turns) for name, turns in found.items()},
+        "rounds": found,
+    }
+    print(json.dumps({**result, "rounds": options.rounds}, indent=1))
     if options.json is not None:
         measuring.write(result, options.json)
 
 
-def measure(method: str, seeds_count: int, rounds: int) -> dict[str, Any]:
-    """Let the groups take turns; medians and extremes of each one's times."""
+def measure(method: str, seeds_count: int, rounds: int) -> dict[str, list[dict[str, float]]]:
+    """Let the groups take turns; each one's times, in seconds, round for round."""
     started = {}
     for name, (processes, devices) in GROUPS.items():
         with socket.socket() as listener:
@@ -61,12 +69,11 @@ def measure(method: str, seeds_count: int, rounds: int) -> dict[str, Any]:
         job |= {"coordinator": f"127.0.0.1:{port}", "processes": processes}
         started[name] = [start(job | {"index": index}) for index in range(processes)]
     try:
-        # The first turn compiles.
         found = [{name: turn(workers) for name, workers in started.items()} for _ in range(rounds)]
     finally:
         for worker in (worker for workers in started.values() for worker in workers):
             worker.kill()
-    return {name: spread([turns[name] for turns in found]) for name in started}
+    return {name: [turns[name] for turns in found] for name in started}
 
 
 def start(job: dict[str, Any]) -> subprocess.Popen:
@@ -85,13 +92,9 @@ def turn(workers: list[subprocess.Popen]) -> dict[str, float]:
     return json.loads(lines[0])
 
 
-def spread(turns: list[dict[str, float]]) -> dict[str, list[float]]:
-    """Median, least and largest of every quantity."""
-    columns = {name: [found[name] for found in turns] for name in turns[0]}
-    return {
-        name: [statistics.median(column), min(column), max(column)]
-        for name, column in columns.items()
-    }
+def medians(turns: list[dict[str, float]]) -> dict[str, float]:
+    """Of every quantity."""
+    return {name: statistics.median(turn[name] for turn in turns) for name in turns[0]}
 
 
 def work(
@@ -114,10 +117,11 @@ def work(
     split = seeds.sharding(spread_over)
     extra = [
         jax.jit(lambda n=n: jnp.zeros((programs.lanes, n)), out_shardings=split)()
-        for n in EXTRA_FLOATS
+        for n in (EXTRA_FLOATS if processes > 1 else ())
     ]
     begun, warm = 0, False
     for _ in sys.stdin:
+        # The first turn compiles, and its first chunk learns nothing before step 200.
         for last in (True,) if warm else (False, False, True):
             times = {}
             steps = jnp.arange(begun, begun + cells.CHUNK, dtype=jnp.int32)
@@ -125,8 +129,9 @@ def work(
             state, log = jax.block_until_ready(programs.run(state, groups, None, steps, None))
             times["chunk_s"] = time.perf_counter() - before
             timed(times, "gather", log)
-            for number, array in zip(EXTRA_FLOATS, extra, strict=True):
-                timed(times, f"gather_{number}", array)
+            times["gather_bytes"] = sum(leaf.nbytes for leaf in jax.tree.leaves(log))
+            for array in extra:
+                timed(times, f"gather_{array.nbytes}_bytes", array)
             before = time.perf_counter()
             distributed.any_process(False)
             times["flag_s"] = time.perf_counter() - before
@@ -136,11 +141,10 @@ def work(
 
 
 def timed(times: dict[str, float], name: str, tree: Any) -> None:
-    """Gather a tree; note the seconds and the bytes."""
+    """Gather a tree; note the seconds."""
     before = time.perf_counter()
-    whole = distributed.gather(tree)
+    distributed.gather(tree)
     times[f"{name}_s"] = time.perf_counter() - before
-    times[f"{name}_bytes"] = sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(whole))
 
 
 if __name__ == "__main__":
