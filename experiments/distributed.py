@@ -1,21 +1,17 @@
-"""One run on several processes, under JAX's own multi-process runtime; docs/scaling.md.
+"""What the processes of one run tell each other; docs/scaling.md.
 
 Every process runs the same program on the same values: whatever the host decides from comes from
 `gather`, or from process 0 by `from_writer`. Process 0 alone prints, and touches the run's folder.
 """
 
 import atexit
-import concurrent.futures
+import contextlib
+import dataclasses
 import functools
 import io
 import json
-import multiprocessing
-import os
+import multiprocessing.connection
 import signal
-import subprocess
-import sys
-import threading
-import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -27,109 +23,23 @@ from cmedirl_jax.types import Transition
 from experiments.errors import UserError
 from experiments.presets import Grid
 
-HEARTBEAT_TIMEOUT = 20
-"""Seconds after which a process that has fallen silent counts as dead."""
-GONE = (
-    "run_grid: another process is gone, or never came; "
-    "start the same command on all machines again to continue"
-)
-_WORKER = "CMEDIRL_JAX_DISTRIBUTED_WORKER"
 _BLOCK = 4096
 """Bytes are sent in whole blocks, so that few sizes are compiled."""
 
 
-def check(grid: Grid) -> None:
-    """Refuse options that contradict each other.
+def check_same(grid: Grid) -> None:
+    """See that every process was started with the same options. A collective.
 
     Raises:
-        UserError: naming the option, what is wrong and what would be right.
+        UserError: on every process, if one was not.
     """
-    if grid.coordinator is None:
-        for name in ("processes", "process_id"):
-            if getattr(grid, name) is not None:
-                raise UserError(f"--{name.replace('_', '-')}: needs --coordinator HOST:PORT")
-        return
-    host, _, port = grid.coordinator.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
-        raise UserError(f"--coordinator: must be HOST:PORT, got {grid.coordinator}")
-    if grid.processes is None or grid.process_id is None:
-        raise UserError("--coordinator: needs --processes N and --process-id I too")
-    if grid.processes < 1:
-        raise UserError(f"--processes: must be at least 1, got {grid.processes}")
-    if not 0 <= grid.process_id < grid.processes:
-        last = grid.processes - 1
-        raise UserError(f"--process-id: must be between 0 and {last}, got {grid.process_id}")
-
-
-def is_asked(grid: Grid) -> bool:
-    """Whether the run has several processes, of which this is one."""
-    return grid.distributed or grid.coordinator is not None
-
-
-def supervise(arguments: Sequence[str]) -> int:
-    """Run this process's share in a child; returns the command's exit code.
-
-    JAX's runtime aborts a process that loses the coordinator, before Python can say a word; so
-    somebody else must. The child ends when this process does.
-    """
-    child = subprocess.Popen(
-        [sys.executable, "-m", "experiments.run_grid", *arguments],
-        env=os.environ | {_WORKER: "1"},
-        stdin=subprocess.PIPE,
-        start_new_session=True,
-    )
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, _: child.send_signal(number))
-    code = child.wait()
-    if code == -signal.SIGABRT:
-        print(GONE, file=sys.stderr)
-    elif code < 0:
-        print(f"run_grid: ended by signal {-code}", file=sys.stderr)
-    return 1 if code < 0 else code
-
-
-def is_worker() -> bool:
-    """Whether this process is a child of `supervise`."""
-    return _WORKER in os.environ
-
-
-def join(grid: Grid) -> None:
-    """Meet the other processes; before any other use of JAX.
-
-    Raises:
-        UserError: if JAX's cluster detection finds no cluster.
-    """
-    _end_after(lambda: os.read(sys.stdin.fileno(), 1))
-    # It would take SIGTERM for itself.
-    jax.config.update("jax_enable_preemption_service", False)
-    try:
-        jax.distributed.initialize(
-            grid.coordinator,
-            grid.processes,
-            grid.process_id,
-            # With all four given, JAX looks for no cluster.
-            cluster_detection_method=None if grid.coordinator is None else "deactivate",
-            heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT,
-        )
-    except ValueError as error:
-        raise UserError(
-            f"--distributed: JAX detects no cluster here ({error}); "
-            "give --coordinator HOST:PORT --processes N --process-id I"
-        ) from error
-
-
-def guarded(run: Callable[[], int]) -> int:
-    """Run a worker's share; on any failure end at once, so that the others learn of it."""
-    try:
-        return run()
-    except Exception as error:
-        # An ordinary exit would wait for processes that wait for this one.
-        if isinstance(error, jax.errors.JaxRuntimeError) and "Gloo" in str(error):
-            print(GONE, file=sys.stderr, flush=True)
-        else:
-            traceback.print_exc()
-        sys.stdout.flush()
-        os._exit(1)
+    mine = json.loads(json.dumps(dataclasses.asdict(grid), default=str))
+    writers = from_writer(lambda: mine)
+    own = ("out", "coordinator", "process_id")
+    other = [name for name in mine if name not in own and mine[name] != writers[name]]
+    if any_process(bool(other)):
+        here = ", ".join(other) or "another process"
+        raise UserError(f"--process-id: not all processes were given the same options ({here})")
 
 
 def is_writer() -> bool:
@@ -246,35 +156,38 @@ def alone(function: Callable[..., Any], *arguments: Any) -> Any:
     """
     if jax.process_count() == 1:
         return function(*arguments)
-    return _clerk().submit(function, *arguments).result()
+    clerk = _clerk()
+    clerk.send((function, arguments))
+    error, result = clerk.recv()
+    if error is not None:
+        raise error
+    return result
 
 
 @functools.cache
-def _clerk() -> concurrent.futures.Executor:
+def _clerk() -> multiprocessing.connection.Connection:
     spawn = multiprocessing.get_context("spawn")
-    pool = concurrent.futures.ProcessPoolExecutor(1, spawn, _be_clerk)
-    atexit.register(pool.shutdown)
-    return pool
+    mine, clerks = spawn.Pipe()
+    spawn.Process(target=_serve, args=(clerks,)).start()
+    clerks.close()
+    atexit.register(mine.close)
+    return mine
 
 
-def _be_clerk() -> None:
+def _serve(caller: multiprocessing.connection.Connection) -> None:
+    """Call what `caller` sends, until it is gone."""
     jax.config.update("jax_platforms", "cpu")
-    # Whoever stops the run stops its parent, which may still want something saved.
+    # Whoever stops the run stops the caller, who may still want something saved.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    _end_after(parent.join)
-
-
-def _end_after(wait: Callable[[], Any]) -> None:
-    """End this process as soon as `wait`, which a thread calls, returns."""
-
-    def end() -> None:
-        wait()
-        os._exit(1)
-
-    threading.Thread(target=end, daemon=True).start()
+    with contextlib.suppress(EOFError):
+        while True:
+            function, arguments = caller.recv()
+            try:
+                answer = None, function(*arguments)
+            except Exception as error:
+                answer = error, None
+            caller.send(answer)
 
 
 def _from_writer(data: bytes) -> bytes:

@@ -14,7 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from experiments import compilation, distributed, interruption, planning
+from experiments import compilation, distributed, interruption, planning, processes
 from experiments import grid as grid_lib
 from experiments.errors import UserError
 from experiments.interruption import Interrupted
@@ -28,14 +28,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     grid = parse(arguments)
     try:
-        distributed.check(grid)
+        processes.check(grid)
     except UserError as error:
         return _end(2, str(error))
-    if not distributed.is_asked(grid):
+    if not processes.is_asked(grid):
         return work(grid)
-    if not distributed.is_worker():
-        return distributed.supervise(arguments)
-    return distributed.guarded(lambda: work(grid))
+    if not processes.is_worker():
+        return processes.supervise(arguments)
+    return processes.guarded(lambda: work(grid))
 
 
 def work(grid: Grid) -> int:
@@ -102,13 +102,17 @@ def start_devices(grid: Grid) -> list[jax.Device]:
         # Once JAX has started (a second call in one process) it keeps the devices it has.
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", wanted)
-    if distributed.is_asked(grid):
-        distributed.join(grid)
+    if processes.is_asked(grid):
+        processes.join(grid)
     devices = jax.local_devices()
     available = len(devices) if devices[0].platform != "cpu" else cores()
-    if grid.devices is not None and grid.devices > available:
-        raise UserError(f"--devices: {grid.devices} asked, there are {available}")
-    if distributed.is_asked(grid):
+    refused = grid.devices is not None and grid.devices > available
+    # Together: a process that left alone would keep the others waiting.
+    if distributed.any_process(refused):
+        there = f"there are {available}" if refused else "another process has fewer"
+        raise UserError(f"--devices: {grid.devices} asked, {there}")
+    if processes.is_asked(grid):
+        distributed.check_same(grid)
         return distributed.devices(grid.devices, grid.seeds)
     return devices[: max(grid.devices, 1)] if grid.devices is not None else devices
 

@@ -1,0 +1,151 @@
+"""`python -m benchmarks.scaling`: the same seeds on one process and on two, chunk by chunk.
+
+Three groups of processes take turns: one process with two devices, two processes with one device
+each over loopback, and one process with one device and half of the seeds, which is the share of one
+device. What the processes tell each other after every chunk is timed apart.
+"""
+
+import argparse
+import json
+import socket
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks import measuring
+from cmedirl_jax import envs, seeds
+from cmedirl_jax.methods import METHODS, Settings
+from experiments import cells, distributed, judging
+
+GROUPS = {"1 process x 2 devices": (1, 2), "2 processes x 1 device": (2, 1), "its share": (1, 1)}
+"""Processes, and devices of each."""
+PAIR = list(GROUPS)[:2]
+EXTRA_FLOATS = (2**12, 2**14, 2**16)
+"""Sizes of further arrays that are gathered, per seed, to tell latency from bandwidth."""
+
+
+def main() -> None:
+    """Measure, or be one of the processes that are measured."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--method", default="ddpg", help="a method without demonstrations")
+    parser.add_argument("--seeds", type=int, default=100)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--worker", type=json.loads, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.worker is not None:
+        work(**options.worker)
+        return
+    found = measure(options.method, options.seeds, options.rounds)
+    one, two = ([turn["chunk_s"] + turn["gather_s"] for turn in found[name]] for name in PAIR)
+    ratios = sorted(a / b for a, b in zip(one, two, strict=True))
+    result = measuring.heading("scaling") | {
+        "method": options.method,
+        "seeds": options.seeds,
+        "two_processes_rate_over_one": [statistics.median(ratios), ratios[0], ratios[-1]],
+        "medians": {name: medians(turns) for name, turns in found.items()},
+        "rounds": found,
+    }
+    print(json.dumps({**result, "rounds": options.rounds}, indent=1))
+    if options.json is not None:
+        measuring.write(result, options.json)
+
+
+def measure(method: str, seeds_count: int, rounds: int) -> dict[str, list[dict[str, float]]]:
+    """Let the groups take turns; each one's times, in seconds, round for round."""
+    started = {}
+    for name, (processes, devices) in GROUPS.items():
+        with socket.socket() as listener:
+            listener.bind(("127.0.0.1", 0))
+            port = listener.getsockname()[1]
+        share = seeds_count if processes * devices > 1 else seeds_count // 2
+        job = {"method": method, "seeds_count": share, "devices": devices}
+        job |= {"coordinator": f"127.0.0.1:{port}", "processes": processes}
+        started[name] = [start(job | {"index": index}) for index in range(processes)]
+    try:
+        found = [{name: turn(workers) for name, workers in started.items()} for _ in range(rounds)]
+    finally:
+        for worker in (worker for workers in started.values() for worker in workers):
+            worker.kill()
+    return {name: [turns[name] for turns in found] for name in started}
+
+
+def start(job: dict[str, Any]) -> subprocess.Popen:
+    """A process that is measured."""
+    command = [sys.executable, "-m", "benchmarks.scaling", "--worker", json.dumps(job)]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def turn(workers: list[subprocess.Popen]) -> dict[str, float]:
+    """One chunk of a group; the times that its first process measured."""
+    for worker in workers:
+        worker.stdin.write("go\n")
+        worker.stdin.flush()
+    # The transport of the collectives prints too.
+    lines = [next(line for line in worker.stdout if line.startswith("{")) for worker in workers]
+    return json.loads(lines[0])
+
+
+def medians(turns: list[dict[str, float]]) -> dict[str, float]:
+    """Of every quantity."""
+    return {name: statistics.median(turn[name] for turn in turns) for name in turns[0]}
+
+
+def work(
+    method: str, seeds_count: int, devices: int, coordinator: str, processes: int, index: int
+) -> None:
+    """Train a chunk whenever a line comes, and print how long that took, as JSON."""
+    jax.config.update("jax_num_cpu_devices", devices)
+    if processes > 1:
+        jax.distributed.initialize(coordinator, processes, index)
+    spread_over = distributed.devices(devices, seeds_count)
+    env, settings = envs.make("MountainCarContinuous-v0"), Settings()
+    group = seeds.group_size(seeds_count, len(spread_over), settings.architecture.hidden)
+    shape = (env, settings.architecture, group, spread_over)
+    judge, draw = judging.of_networks(*shape), cells.compile_networks(*shape)
+    sizes = {"group": group, "seeds_count": seeds_count, "capacity": 12_000, "subset_size": 1}
+    programs = cells.compile_method(
+        env, METHODS[method], settings, judge, draw, devices=spread_over, **sizes
+    )
+    _, state, groups = cells.begin(programs, jax.random.key(0), None, 0, seeds_count)
+    split = seeds.sharding(spread_over)
+    extra = [
+        jax.jit(lambda n=n: jnp.zeros((programs.lanes, n)), out_shardings=split)()
+        for n in (EXTRA_FLOATS if processes > 1 else ())
+    ]
+    begun, warm = 0, False
+    for _ in sys.stdin:
+        # The first turn compiles, and its first chunk learns nothing before step 200.
+        for last in (True,) if warm else (False, False, True):
+            times = {}
+            steps = jnp.arange(begun, begun + cells.CHUNK, dtype=jnp.int32)
+            before = time.perf_counter()
+            state, log = jax.block_until_ready(programs.run(state, groups, None, steps, None))
+            times["chunk_s"] = time.perf_counter() - before
+            timed(times, "gather", log)
+            times["gather_bytes"] = sum(leaf.nbytes for leaf in jax.tree.leaves(log))
+            for array in extra:
+                timed(times, f"gather_{array.nbytes}_bytes", array)
+            before = time.perf_counter()
+            distributed.any_process(False)
+            times["flag_s"] = time.perf_counter() - before
+            begun += cells.CHUNK
+            warm = last
+        print(json.dumps(times), flush=True)
+
+
+def timed(times: dict[str, float], name: str, tree: Any) -> None:
+    """Gather a tree; note the seconds."""
+    before = time.perf_counter()
+    distributed.gather(tree)
+    times[f"{name}_s"] = time.perf_counter() - before
+
+
+if __name__ == "__main__":
+    main()

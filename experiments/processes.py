@@ -1,0 +1,122 @@
+"""The life of a run's processes: they meet, are watched, and end together; docs/scaling.md."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+
+import jax
+
+from experiments.errors import UserError
+from experiments.presets import Grid
+
+HEARTBEAT_TIMEOUT = 20
+"""Seconds after which a process that has fallen silent counts as dead."""
+GONE = (
+    "run_grid: another process is gone, or never came; "
+    "start the same command on all machines again to continue"
+)
+_WORKER = "CMEDIRL_JAX_DISTRIBUTED_WORKER"
+
+
+def check(grid: Grid) -> None:
+    """Refuse options that contradict each other.
+
+    Raises:
+        UserError: naming the option, what is wrong and what would be right.
+    """
+    if grid.coordinator is None:
+        for name in ("processes", "process_id"):
+            if getattr(grid, name) is not None:
+                raise UserError(f"--{name.replace('_', '-')}: needs --coordinator HOST:PORT")
+        return
+    host, _, port = grid.coordinator.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
+        raise UserError(f"--coordinator: must be HOST:PORT, got {grid.coordinator}")
+    if grid.processes is None or grid.process_id is None:
+        raise UserError("--coordinator: needs --processes N and --process-id I too")
+    if grid.processes < 1:
+        raise UserError(f"--processes: must be at least 1, got {grid.processes}")
+    if not 0 <= grid.process_id < grid.processes:
+        last = grid.processes - 1
+        raise UserError(f"--process-id: must be between 0 and {last}, got {grid.process_id}")
+
+
+def is_asked(grid: Grid) -> bool:
+    """Whether the run has several processes, of which this is one."""
+    return grid.distributed or grid.coordinator is not None
+
+
+def supervise(arguments: Sequence[str]) -> int:
+    """Run this process's share in a child; returns the command's exit code.
+
+    JAX's runtime aborts a process that loses the coordinator, before Python can say a word; so
+    somebody else must. The child ends when this process does.
+    """
+    child = subprocess.Popen(
+        [sys.executable, "-m", "experiments.run_grid", *arguments],
+        env=os.environ | {_WORKER: "1"},
+        stdin=subprocess.PIPE,
+        start_new_session=True,
+    )
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: child.send_signal(number))
+    code = child.wait()
+    if code == -signal.SIGABRT:
+        print(GONE, file=sys.stderr)
+    elif code < 0:
+        print(f"run_grid: ended by signal {-code}", file=sys.stderr)
+    return 1 if code < 0 else code
+
+
+def is_worker() -> bool:
+    """Whether this process is a child of `supervise`."""
+    return _WORKER in os.environ
+
+
+def join(grid: Grid) -> None:
+    """Meet the other processes; before any other use of JAX.
+
+    Raises:
+        UserError: if JAX's cluster detection finds no cluster.
+    """
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    # It would take SIGTERM for itself.
+    jax.config.update("jax_enable_preemption_service", False)
+    try:
+        jax.distributed.initialize(
+            grid.coordinator,
+            grid.processes,
+            grid.process_id,
+            # With all four given, JAX looks for no cluster.
+            cluster_detection_method=None if grid.coordinator is None else "deactivate",
+            heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT,
+        )
+    except ValueError as error:
+        raise UserError(
+            f"--distributed: JAX detects no cluster here ({error}); "
+            "give --coordinator HOST:PORT --processes N --process-id I"
+        ) from error
+
+
+def guarded(run: Callable[[], int]) -> int:
+    """Run a worker's share; on any failure end at once, so that the others learn of it."""
+    try:
+        return run()
+    except Exception as error:
+        # An ordinary exit would wait for the processes that wait for this one.
+        lost = any(transport in str(error) for transport in ("Gloo", "NCCL", "oordination"))
+        if isinstance(error, jax.errors.JaxRuntimeError) and lost:
+            print(GONE, file=sys.stderr, flush=True)
+        else:
+            traceback.print_exc()
+        sys.stdout.flush()
+        os._exit(1)
+
+
+def _end_with_parent() -> None:
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)
