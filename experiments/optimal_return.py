@@ -20,12 +20,20 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from cmedirl_jax import envs
+from cmedirl_jax import envs, ranges
 from cmedirl_jax.envs import Env
 from cmedirl_jax.tabular import discretise, interpolation
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.tabular.optimal_control import value_iteration
 from experiments import compilation
+
+RANGES = {
+    "states": ranges.TWO_OR_MORE,
+    "actions": ranges.TWO_OR_MORE,
+    "discount": ranges.BELOW_ONE,
+    "starts": ranges.SIZE,
+}
+"""Of every number in `Options`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,11 +86,12 @@ def optimal_returns(options: Options) -> pl.DataFrame:
     `attained_return` what that is undiscounted.
 
     Raises:
-        ValueError: for an unknown environment, one that cannot be discretised, or a wrong size.
+        ValueError: for an unknown environment, one that cannot be discretised, or a number out of
+            its range.
     """
+    for name, wrong in ranges.out_of_range(options, RANGES):
+        raise ValueError(f"--{name}: {wrong}")
     env = envs.make(options.env)
-    if options.starts < 1:
-        raise ValueError(f"starts must be at least 1, got {options.starts}")
     spec, params = env.spec, env.default_params
     first = np.asarray(env.starts(options.starts, params)[1])
     rows = []

@@ -32,6 +32,16 @@ PACKAGES = (
 TABLES = ("seeds", "episodes", "evaluations")
 """In the order they are written."""
 
+COLUMNS = {
+    "seeds": (
+        *("seed", "env_steps", "episodes", "demonstration_steps", "expert_steps", "diverged"),
+        *("best_return", "gymnasium_return", "gymnasium_difference"),
+    ),
+    "episodes": ("seed", "episode", "env_step", "return"),
+    "evaluations": ("expert", "protocol", "seed", "env_step", "episode", "return_mean"),
+}
+"""What the summary and the figures read of each table, beside `method` and `n_demos`."""
+
 DAMAGED = (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException)
 """What reading a damaged table raises; polars panics where a flipped bit breaks its assumptions."""
 
@@ -189,7 +199,11 @@ def finished(folder: Path) -> set[tuple[str, int]]:
         UserError: if a table is damaged.
     """
     try:
-        evaluations, *_ = [read(folder, name) for name in reversed(TABLES)]
+        tables = {name: read(folder, name) for name in TABLES}
+        for name, table in tables.items():
+            if table is not None:
+                table.select(COLUMNS[name])
+        evaluations = tables["evaluations"]
         if evaluations is None:
             return set()
         return set(evaluations.select("method", "n_demos").unique().iter_rows())

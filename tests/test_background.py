@@ -97,7 +97,9 @@ def stepper(weights, objective, behaviour):
         greedy = networks.policy(NETWORKS, actor, observation)
         key = jax.random.fold_in(KEY, number)
         action, log_density, noise = acting.sample(key, noise, greedy, number)
-        transition = Transition(observation, action, number, -observation, ended)
+        transition = Transition(
+            observation, action, number.astype(jnp.float32), -observation, ended
+        )
         storage = REPLAY.add(ReplayState(storage, number), transition).storage
         return record(state, actor, number, log_density, ended), storage, noise, log_density
 

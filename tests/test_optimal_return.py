@@ -22,16 +22,17 @@ def test_values_and_what_is_attained_by_them(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "line"),
     [
-        (["--states", "1"], "a grid needs two points along each dimension"),
-        (["--starts", "0"], "starts must be at least 1, got 0"),
-        (["--env", "Pendulum-v1"], "unknown environment"),
+        ("--states 101 1", "--states: must be at least 2, got 1"),
+        ("--actions 0", "--actions: must be at least 2, got 0"),
+        ("--discount 1", "--discount: must be at least 0 and below 1, got 1.0"),
+        ("--starts 0", "--starts: must be at least 1, got 0"),
+        ("--env Walker2d-v5", "unknown environment 'Walker2d-v5'; there are: "),
     ],
 )
-def test_mistakes_end_in_one_line(arguments, message, capsys):
-    assert optimal_return.main(arguments) == 2
+def test_mistakes_are_refused_in_a_line(arguments, line, capsys):
+    assert optimal_return.main(arguments.split()) == 2
     error = capsys.readouterr().err
-    assert error.startswith("optimal_return: ")
-    assert message in error
+    assert error.startswith(f"optimal_return: {line}")
     assert error.count("\n") == 1

@@ -34,11 +34,13 @@ def opened(grid):
 
 
 def cell(method, n_demos, episodes=3):
-    """A finished cell's rows."""
-    table = pl.DataFrame({"value": [0.5, 1.5]}).select(
-        pl.lit(method).alias("method"), pl.lit(n_demos).alias("n_demos"), "value"
-    )
-    return {"seeds": table, "episodes": table.head(episodes), "evaluations": table}
+    """A finished cell's rows, of numbers that say nothing."""
+    labels = pl.lit(method).alias("method"), pl.lit(n_demos).alias("n_demos")
+    tables = {
+        name: pl.DataFrame({key: [0.5, 1.5] for key in columns}).select(*labels, pl.all())
+        for name, columns in results.COLUMNS.items()
+    }
+    return tables | {"episodes": tables["episodes"].head(episodes)}
 
 
 def test_configuration_is_strict_json_with_versions(tmp_path):
@@ -206,7 +208,7 @@ def test_a_first_cell_cut_off_before_its_last_table_leaves_no_finished_cell(tmp_
 
 
 @pytest.mark.parametrize("table", results.TABLES)
-@pytest.mark.parametrize("damage", ["empty", "garbage", "cut short", "foreign"])
+@pytest.mark.parametrize("damage", ["empty", "garbage", "cut short", "foreign", "another's"])
 def test_a_damaged_table_is_a_users_error(tmp_path, table, damage):
     results.append(tmp_path, cell("ddpg", 0))
     path = tmp_path / f"{table}.parquet"
@@ -219,6 +221,8 @@ def test_a_damaged_table_is_a_users_error(tmp_path, table, damage):
             path.write_bytes(path.read_bytes()[:-20])
         case "foreign":
             pl.DataFrame({"another": [1]}).write_parquet(path)
+        case "another's":
+            pl.DataFrame({"method": ["ddpg"], "n_demos": [0]}).write_parquet(path)
     with pytest.raises(UserError, match=r"^--out: .*damaged table") as error:
         results.finished(tmp_path)
     assert "\n" not in str(error.value)
