@@ -23,8 +23,8 @@ from cmedirl_jax.types import Transition
 from experiments.errors import UserError
 from experiments.presets import Grid
 
-_BLOCK = 4096
-"""Bytes are sent in whole blocks, so that few sizes are compiled."""
+_BLOCK, _PIECE = 2**12, 2**26
+"""Bytes are sent in pieces, the last in whole blocks, so that few sizes are compiled."""
 
 
 def check_same(grid: Grid) -> None:
@@ -194,10 +194,12 @@ def _from_writer(data: bytes) -> bytes:
     """Process 0's bytes, on every process."""
     if not is_writer():
         data = b""
-    size = int(_total(np.int32([len(data)]))[0])
-    block = np.zeros(-(-size // _BLOCK) * _BLOCK, np.uint8)
-    block[: len(data)] = np.frombuffer(data, np.uint8)
-    return _total(block)[:size].tobytes()
+    pieces, rest = (int(part) for part in _total(np.int32(divmod(len(data), _PIECE))))
+    whole = np.zeros(pieces * _PIECE + -(-rest // _BLOCK) * _BLOCK, np.uint8)
+    whole[: len(data)] = np.frombuffer(data, np.uint8)
+    for start in range(0, whole.size, _PIECE):
+        whole[start : start + _PIECE] = _total(whole[start : start + _PIECE])
+    return whole[: pieces * _PIECE + rest].tobytes()
 
 
 def _total(mine: np.ndarray) -> np.ndarray:

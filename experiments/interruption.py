@@ -2,6 +2,7 @@
 
 import contextlib
 import signal
+import time
 from collections.abc import Iterator
 from types import FrameType
 from typing import NoReturn
@@ -9,6 +10,8 @@ from typing import NoReturn
 from experiments import distributed
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+TWICE = 1.0
+"""Seconds within which a second signal is the first once more: some schedulers send it twice."""
 
 
 class Interrupted(Exception):
@@ -44,8 +47,8 @@ class Interruption:
 
 @contextlib.contextmanager
 def noted() -> Iterator[Interruption]:
-    """Note the first SIGINT or SIGTERM of this block; a second one acts as it would without it."""
-    interruption = Interruption()
+    """Note the first SIGINT or SIGTERM of this block; a later one acts as it would without it."""
+    interruption, first = Interruption(), 0.0
     before = {number: signal.getsignal(number) for number in SIGNALS}
 
     def restore() -> None:
@@ -53,8 +56,12 @@ def noted() -> Iterator[Interruption]:
             signal.signal(number, handler)
 
     def note(number: int, _: FrameType | None) -> None:
-        interruption.signal = number
-        restore()
+        nonlocal first
+        if interruption.signal is None:
+            interruption.signal, first = number, time.monotonic()
+        elif time.monotonic() - first >= TWICE:
+            restore()
+            signal.raise_signal(number)
 
     for number in SIGNALS:
         signal.signal(number, note)

@@ -84,6 +84,8 @@ def join(grid: Grid) -> None:
         UserError: if JAX's cluster detection finds no cluster.
     """
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    # At once, unless noted: an exception would leave the others waiting.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     # It would take SIGTERM for itself.
     jax.config.update("jax_enable_preemption_service", False)
     try:
@@ -103,9 +105,14 @@ def join(grid: Grid) -> None:
 
 
 def guarded(run: Callable[[], int]) -> int:
-    """Run a worker's share; on any failure end at once, so that the others learn of it."""
+    """Run a worker's share; where it fails alone end at once, so that the others learn of it."""
     try:
-        return run()
+        code = run()
+        # What all agree on they may leave in peace: 2, or a signal's code.
+        if code != 1:
+            return code
+        sys.stdout.flush()
+        os._exit(code)
     except Exception as error:
         # An ordinary exit would wait for the processes that wait for this one.
         lost = any(transport in str(error) for transport in ("Gloo", "NCCL", "oordination"))

@@ -20,11 +20,20 @@ def test_a_signal_is_noted_and_obeyed_later(number, code):
     assert signal.getsignal(number) is before
 
 
-def test_a_second_signal_acts_at_once():
+def test_a_second_signal_acts_at_once(monkeypatch):
+    monkeypatch.setattr(interruption, "TWICE", 0.0)
     with interruption.noted():
         os.kill(os.getpid(), signal.SIGTERM)
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_signal_sent_twice_is_one():
+    with interruption.noted() as noted:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(Interrupted, match="SIGTERM"):
+            noted.stop()
 
 
 def test_handlers_are_put_back_after_an_error():
