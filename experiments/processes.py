@@ -116,7 +116,8 @@ def guarded(run: Callable[[], int]) -> int:
     except Exception as error:
         # An ordinary exit would wait for the processes that wait for this one.
         lost = any(transport in str(error) for transport in ("Gloo", "NCCL", "oordination"))
-        if isinstance(error, jax.errors.JaxRuntimeError) and lost:
+        # A value that never came is a ValueError to whoever looks at it.
+        if isinstance(error, jax.errors.JaxRuntimeError | ValueError) and lost:
             print(GONE, file=sys.stderr, flush=True)
         else:
             traceback.print_exc()

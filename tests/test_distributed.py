@@ -187,12 +187,21 @@ def assert_same_tables(folder, expected):
         assert_frame_equal(found, wanted, rel_tol=1e-3, abs_tol=1e-3)
 
 
-def test_a_dead_process_ends_the_others_and_a_restart_gives_what_one_process_gives(
+def test_stopped_together_or_bereaved_they_go_on_to_what_one_process_gives(
     together, alone, tmp_path
 ):
     folder = tmp_path / "run-0"
     with together() as run:
+        wait_for(run, lambda: "[1/2] me-ddpg-n1" in run.output(0))
+        # One is told to stop, all do, where they can go on from.
+        run.running[1].send_signal(signal.SIGTERM)
+        assert run.codes(60) == [143, 143], run.output(0) + run.output(1)
+        for index in range(PROCESSES):
+            assert "run_grid: stopped by SIGTERM" in run.output(index).splitlines()[-1]
+
+    with together() as run:
         wait_for(run, (folder / "evaluations.parquet").exists)
+        assert "me-ddpg-n1, 9 seeds goes on from its checkpoint" in run.output(0)
         # The first cell is finished; it dies in the second.
         run.running[1].kill()
         assert run.codes(60) == [1, -signal.SIGKILL]
