@@ -1,5 +1,6 @@
 """Runs that are killed, stopped, started twice or out of disk, as real processes."""
 
+import contextlib
 import os
 import random
 import shutil
@@ -134,35 +135,44 @@ def test_a_run_that_was_killed_three_times_is_as_one_that_never_was(runs, whole,
     assert_same_run(run, whole)
 
 
-def saving(run):
-    return any(run.glob("checkpoints/*/.partial"))
+def written_since(moment, run, pattern):
+    """Whether a path of the run was made or changed after `moment`."""
+    for path in run.glob(pattern):
+        with contextlib.suppress(FileNotFoundError):
+            if path.stat().st_mtime > moment:
+                return True
+    return False
 
 
 PHASES = {
-    "compiling": lambda run: (run / "config.json").exists(),
-    "training": lambda run: progress(run) >= 500,
-    "saving a checkpoint": saving,
-    "saving a policy": lambda run: any(run.glob("policies/*tmp*")),
-    "writing tables": lambda run: any(run.glob(".*.parquet.partial")),
-    "drawing": lambda run: (run / "figures").exists(),
+    "compiling": ("config.json", 5.0),
+    "training and evaluating": ("checkpoints/*/[0-9]*", 0.5),
+    "saving a checkpoint": ("checkpoints/*/.partial", 0.02),
+    "saving a policy": ("policies/*tmp*", 0.02),
+    "writing tables": (".*.parquet.partial", 0.02),
+    "drawing": ("figures/*", 0.2),
 }
+"""What is written when a phase begins, and seconds that it takes."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("phase", PHASES)
 def test_a_run_may_be_killed_in_any_phase(runs, whole, tmp_path, phase):
-    """Four times each, at once or a random while later."""
-    run = tmp_path / "run"
+    """Four times each, at a random moment of the phase."""
+    run, kills = tmp_path / "run", 0
+    pattern, seconds = PHASES[phase]
     moments = random.Random(phase)
-    for _ in range(4):
+    while kills < 4:
         fresh = {}
         if phase == "compiling":
-            fresh["JAX_COMPILATION_CACHE_DIR"] = str(tmp_path / "empty")
-            shutil.rmtree(tmp_path / "empty", ignore_errors=True)
+            # It is written once, and this phase is in every process that finds no program.
+            (run / "config.json").unlink(missing_ok=True)
+            fresh["JAX_COMPILATION_CACHE_DIR"] = str(tmp_path / f"empty-{kills}")
+        began = time.time()
         process = runs.start(run, **fresh)
-        wait_for(process, lambda: PHASES[phase](run))
-        time.sleep(moments.uniform(0.0, 5.0 if phase == "compiling" else 0.05))
-        kill(process)
+        wait_for(process, lambda began=began: written_since(began, run, pattern))
+        time.sleep(moments.uniform(0.0, seconds))
+        kills += kill(process)
         if (run / "summary.csv").exists():
             shutil.rmtree(run)
     runs.finish(run)
