@@ -5,56 +5,76 @@ each over loopback, and one process with one device and half of the seeds, which
 device. What the processes tell each other after every chunk is timed apart.
 """
 
-import argparse
+import dataclasses
 import json
 import socket
 import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import tyro
 
 from benchmarks import measuring
 from cmedirl_jax import envs, seeds
 from cmedirl_jax.methods import METHODS, Settings
 from experiments import cells, distributed, judging
+from experiments import programs as programs_lib
+from experiments.lanes import Lanes
 
 GROUPS = {"1 process x 2 devices": (1, 2), "2 processes x 1 device": (2, 1), "its share": (1, 1)}
 """Processes, and devices of each."""
+WORKER = "--worker"
 PAIR = list(GROUPS)[:2]
 EXTRA_FLOATS = (2**12, 2**14, 2**16)
 """Sizes of further arrays that are gathered, per seed, to tell latency from bandwidth."""
 
 
-def main() -> None:
-    """Measure, or be one of the processes that are measured."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--method", default="ddpg", help="a method without demonstrations")
-    parser.add_argument("--seeds", type=int, default=100)
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--worker", type=json.loads, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.worker is not None:
-        work(**options.worker)
-        return
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to measure, and where to write it."""
+
+    method: str = "ddpg"
+    """A method without demonstrations."""
+    seeds: int = 100
+    """Seeds that the groups share."""
+    rounds: int = 7
+    """Turns of each group."""
+    json: Path | None = None
+    """File for the measurements."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, or be one of the processes that are measured; returns the exit code."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments[:1] == [WORKER]:
+        work(**json.loads(arguments[1]))
+        return 0
+    options = tyro.cli(Options, prog="python -m benchmarks.scaling", args=arguments)
     found = measure(options.method, options.seeds, options.rounds)
     one, two = ([turn["chunk_s"] + turn["gather_s"] for turn in found[name]] for name in PAIR)
     ratios = sorted(a / b for a, b in zip(one, two, strict=True))
-    result = measuring.heading("scaling") | {
-        "method": options.method,
-        "seeds": options.seeds,
-        "two_processes_rate_over_one": [statistics.median(ratios), ratios[0], ratios[-1]],
-        "medians": {name: medians(turns) for name, turns in found.items()},
-        "rounds": found,
-    }
-    print(json.dumps({**result, "rounds": options.rounds}, indent=1))
+    median = statistics.median(ratios)
+    print(f"Two processes have {median:.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f}) times the rate")
+    for name, turns in found.items():
+        seconds = {key: f"{value:.4g}" for key, value in medians(turns).items()}
+        print(f"{name}: {seconds}")
     if options.json is not None:
+        result = measuring.heading("scaling") | {
+            "method": options.method,
+            "seeds": options.seeds,
+            "two_processes_rate_over_one": [median, ratios[0], ratios[-1]],
+            "medians": {name: medians(turns) for name, turns in found.items()},
+            "rounds": found,
+        }
         measuring.write(result, options.json)
+    return 0
 
 
 def measure(method: str, seeds_count: int, rounds: int) -> dict[str, list[dict[str, float]]]:
@@ -78,7 +98,7 @@ def measure(method: str, seeds_count: int, rounds: int) -> dict[str, list[dict[s
 
 def start(job: dict[str, Any]) -> subprocess.Popen:
     """A process that is measured."""
-    command = [sys.executable, "-m", "benchmarks.scaling", "--worker", json.dumps(job)]
+    command = [sys.executable, "-m", "benchmarks.scaling", WORKER, json.dumps(job)]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
@@ -105,15 +125,18 @@ def work(
     if processes > 1:
         jax.distributed.initialize(coordinator, processes, index)
     spread_over = distributed.devices(devices, seeds_count)
+    distributed.connect(spread_over)
     env, settings = envs.make("MountainCarContinuous-v0"), Settings()
     group = seeds.group_size(seeds_count, len(spread_over), settings.architecture.hidden)
     shape = (env, settings.architecture, group, spread_over)
-    judge, draw = judging.of_networks(*shape), cells.compile_networks(*shape)
+    judge, draw = judging.of_networks(*shape), programs_lib.compile_networks(*shape)
     sizes = {"group": group, "seeds_count": seeds_count, "capacity": 12_000, "subset_size": 1}
-    programs = cells.compile_method(
+    programs = programs_lib.compile_method(
         env, METHODS[method], settings, judge, draw, devices=spread_over, **sizes
     )
-    _, state, groups = cells.begin(programs, jax.random.key(0), None, 0, seeds_count)
+    lanes = Lanes(programs.lanes, seeds_count, programs.group, programs.devices)
+    state = programs_lib.begin(programs, lanes, jax.random.key(0), None, 0)
+    groups = lanes.groups(np.ones(seeds_count, bool))
     split = seeds.sharding(spread_over)
     extra = [
         jax.jit(lambda n=n: jnp.zeros((programs.lanes, n)), out_shardings=split)()
@@ -148,4 +171,4 @@ def timed(times: dict[str, float], name: str, tree: Any) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

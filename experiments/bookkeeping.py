@@ -191,7 +191,7 @@ class Book:
         )
 
     def record(self) -> dict[str, np.ndarray]:
-        """All of it as arrays by name, for `of_record`."""
+        """All of it as arrays by name, for `of_record`; copies, which the book does not change."""
         # Columns end to end, and how many rows each evaluation has; its protocol as a column too.
         rows = [
             found._replace(protocol=np.repeat(found.protocol, len(found.seed)))
@@ -199,7 +199,7 @@ class Book:
         ]
         evaluations = jax.tree.map(lambda *columns: np.concatenate(columns), *rows)
         named = zip(jax.tree.leaves(_EVALUATIONS), jax.tree.leaves(evaluations), strict=True)
-        return {
+        record = {
             **{name: getattr(self, name) for name in _SEEDS},
             **{f"sums.{name}": column for name, column in self._sums._asdict().items()},
             **{f"updates.{name}": column for name, column in self._updates._asdict().items()},
@@ -207,6 +207,7 @@ class Book:
             **{f"evaluations.{name}": column for name, column in named},
             **{f"episodes.{name}": x for name, x in self.episode_rows()._asdict().items()},
         }
+        return {name: np.array(column) for name, column in record.items()}
 
     @classmethod
     def of_record(cls, record: dict[str, np.ndarray], budget: Budget) -> "Book":

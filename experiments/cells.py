@@ -187,7 +187,7 @@ class _Training:
             "best": self.best,
             "best_return": self.best_return,
         }
-        record = {"lane_seed": self.lanes.seed, **self.book.record()}
+        record = {"lane_seed": self.lanes.seed.copy(), **self.book.record()}
         return jax.tree.map(np.array, distributed.gather(tree)), record
 
     def advance(self, stop: int) -> None:

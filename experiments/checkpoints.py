@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 from cmedirl_jax import checkpoint
-from experiments import distributed
+from experiments import clerk, distributed
 from experiments.errors import UserError
 from experiments.interruption import Interruption
 
@@ -49,8 +49,8 @@ class Snapshot(NamedTuple):
 class Keeper:
     """Keeps one cell's training while it runs.
 
-    Saving goes on in the background, one checkpoint at a time. A checkpoint that cannot be written
-    is reported and done without: those before it stay.
+    Saving goes on in the background, one checkpoint at a time; leaving the context waits for it. A
+    checkpoint that cannot be written is reported and done without: those before it stay.
     """
 
     def __init__(
@@ -76,7 +76,13 @@ class Keeper:
         self._saving = concurrent.futures.ThreadPoolExecutor(max_workers=1)
         self._pending: concurrent.futures.Future[None] | None = None
         self._due = time.monotonic() + every
-        self._saved: int | None = None
+
+    def __enter__(self) -> "Keeper":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.wait()
+        self._saving.shutdown()
 
     def load(self, like: Callable[[dict[str, np.ndarray]], Any]) -> Snapshot | None:
         """The newest checkpoint that is whole; those that are not are reported and removed.
@@ -85,7 +91,7 @@ class Keeper:
             like: the abstract state (as `jax.eval_shape` gives it) that belongs to a record.
 
         Raises:
-            UserError: if one was written by a version with another schema.
+            UserError: if one has another schema or identity; it is left as it is.
         """
         held: list[Snapshot] = []
 
@@ -99,12 +105,13 @@ class Keeper:
         found = distributed.from_writer(read)
         if found is None:
             return None
-        self._saved, names = found["step"], found["names"]
+        step, names = found["step"], found["names"]
+        self._say(f"{self.folder.name} goes on from its checkpoint at step {step:,}")
         mine = [*held[0].record.values(), *jax.tree.leaves(held[0].state)] if held else None
         arrays = distributed.arrays_from_writer(mine)
         record = dict(zip(names, arrays, strict=False))
         state = jax.tree.unflatten(jax.tree.structure(like(record)), arrays[len(names) :])
-        return Snapshot(found["step"], state, record)
+        return Snapshot(step, state, record)
 
     def _newest(self, like: Callable[[dict[str, np.ndarray]], Any]) -> Snapshot | None:
         for path in _newest_first(self.folder):
@@ -129,11 +136,9 @@ class Keeper:
         if not stops and not distributed.any_process(time.monotonic() >= self._due):
             return
         self.wait()
-        if self._saved != step:
-            snapshot = Snapshot(step, *take())
-            if distributed.is_writer():
-                self._pending = self._saving.submit(_write, self.folder, self.identity, snapshot)
-            self._saved = step
+        snapshot = Snapshot(step, *take())
+        if distributed.is_writer():
+            self._pending = self._saving.submit(_write, self.folder, self.identity, snapshot)
         self._due = time.monotonic() + self.every
         if stops:
             self.wait()
@@ -143,12 +148,11 @@ class Keeper:
         """Wait until the last checkpoint is on disk."""
         if self._pending is None:
             return
+        pending, self._pending = self._pending, None
         try:
-            self._pending.result()
+            pending.result()
         except OSError as error:
-            self._saved = None
-            self._say(f"no checkpoint could be saved in {self.folder} ({error.strerror})")
-        self._pending = None
+            self._say(f"no checkpoint could be saved in {self.folder} ({error.strerror or error})")
 
     def remove(self) -> None:
         """Remove every checkpoint: the cell is finished."""
@@ -172,9 +176,10 @@ def _write(folder: Path, identity: dict[str, Any], snapshot: Snapshot) -> None:
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
-        distributed.alone(checkpoint.save, partial / "state", snapshot.state)
+        clerk.call(checkpoint.save, partial / "state", snapshot.state)
         with (partial / "record.npz").open("wb") as file:
             np.savez(file, allow_pickle=False, **snapshot.record)
+            os.fsync(file.fileno())
         manifest = {"schema": SCHEMA, "identity": identity, "files": _digests(partial)}
         sealed = {**manifest, "sha256": _digest_of(manifest)}
         (partial / "manifest.json").write_text(json.dumps(sealed, indent=2) + "\n")
@@ -182,7 +187,7 @@ def _write(folder: Path, identity: dict[str, Any], snapshot: Snapshot) -> None:
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     for old in _newest_first(folder)[KEPT:]:
-        shutil.rmtree(old)
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def _read(
@@ -211,13 +216,14 @@ def _read(
             raise _Unusable(f"is damaged ({name})")
     for name in sorted(written.keys() | identity.keys()):
         if written.get(name) != identity.get(name):
-            raise _Unusable(
-                f"was written with {name} {written.get(name)}, not {identity.get(name)}"
+            raise UserError(
+                f"--out: {path} was written with {name} {written.get(name)}, this is "
+                f"{identity.get(name)}; go on with that, or remove it to train the cell anew"
             )
     with np.load(path / "record.npz", allow_pickle=False) as archive:
         record = dict(archive)
     try:
-        state = distributed.alone(checkpoint.load, path / "state", like(record))
+        state = clerk.call(checkpoint.load, path / "state", like(record))
     except ValueError as error:
         raise _Unusable("holds another structure") from error
     return Snapshot(int(path.name), jax.tree.map(np.asarray, state), record)

@@ -4,20 +4,17 @@ Every process runs the same program on the same values: whatever the host decide
 `gather`, or from process 0 by `from_writer`. Process 0 alone prints, and touches the run's folder.
 """
 
-import atexit
-import contextlib
 import dataclasses
 import functools
 import io
 import json
-import multiprocessing.connection
-import signal
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
+from cmedirl_jax import seeds
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.types import Transition
 from experiments.errors import UserError
@@ -47,15 +44,15 @@ def is_writer() -> bool:
     return jax.process_index() == 0
 
 
-def devices(count: int | None, seeds: int) -> list[jax.Device]:
+def devices(count: int | None, seeds_count: int) -> list[jax.Device]:
     """The devices of all processes, those of one process side by side.
 
     Args:
         count: devices of each process, or None for all that get four seeds or more.
-        seeds: that share them.
+        seeds_count: seeds that share them.
     """
     if count is None:
-        count = max(1, seeds // (4 * jax.process_count()))
+        count = max(1, seeds_count // (4 * jax.process_count()))
     return [
         device for process in range(jax.process_count()) for device in _of_process(process)[:count]
     ]
@@ -64,6 +61,15 @@ def devices(count: int | None, seeds: int) -> list[jax.Device]:
 def _of_process(process: int) -> list[jax.Device]:
     found = [device for device in jax.devices() if device.process_index == process]
     return sorted(found, key=lambda device: device.id)
+
+
+def connect(devices: Sequence[jax.Device]) -> None:
+    """Connect devices of all processes, which wait for each other 30 seconds at most.
+
+    Early, while the processes are together: compiling takes some of them longer than others.
+    """
+    split = seeds.sharding(devices)
+    gather(jax.device_put(np.zeros(len(devices), np.int32), split))
 
 
 def gather(tree: Any) -> Any:
@@ -77,10 +83,10 @@ def gather(tree: Any) -> Any:
         for index, leaf in enumerate(leaves)
         if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable
     }
-    for leaf in spread.values():
-        whole = _replicate(leaf.sharding.mesh)(spread)
+    if spread:
+        mesh = next(iter(spread.values())).sharding.mesh
+        whole = _replicate(mesh)(spread)
         leaves = [whole.get(index, leaf) for index, leaf in enumerate(leaves)]
-        break
     return jax.tree.unflatten(structure, [np.asarray(leaf) for leaf in leaves])
 
 
@@ -146,48 +152,6 @@ def pool_from_writer(read: Callable[[], Demonstrations | None]) -> Demonstration
     mine = None if pool is None else [*pool.transition, pool.truncated, pool.episode]
     *transition, truncated, episode = arrays_from_writer(mine)
     return Demonstrations(Transition(*transition), truncated, episode, found)
-
-
-def alone(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function of orbax's on one process; the arguments and the result are pickled.
-
-    Orbax's `save` meets all processes, also when told that one is active: with several of them it
-    works in a child that knows of no others.
-    """
-    if jax.process_count() == 1:
-        return function(*arguments)
-    clerk = _clerk()
-    clerk.send((function, arguments))
-    error, result = clerk.recv()
-    if error is not None:
-        raise error
-    return result
-
-
-@functools.cache
-def _clerk() -> multiprocessing.connection.Connection:
-    spawn = multiprocessing.get_context("spawn")
-    mine, clerks = spawn.Pipe()
-    spawn.Process(target=_serve, args=(clerks,)).start()
-    clerks.close()
-    atexit.register(mine.close)
-    return mine
-
-
-def _serve(caller: multiprocessing.connection.Connection) -> None:
-    """Call what `caller` sends, until it is gone."""
-    jax.config.update("jax_platforms", "cpu")
-    # Whoever stops the run stops the caller, who may still want something saved.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    with contextlib.suppress(EOFError):
-        while True:
-            function, arguments = caller.recv()
-            try:
-                answer = None, function(*arguments)
-            except Exception as error:
-                answer = error, None
-            caller.send(answer)
 
 
 def _from_writer(data: bytes) -> bytes:

@@ -68,7 +68,8 @@ def make_pool(
     if not chosen.size:
         raise UserError(
             f"--experts: none of {options.seeds} experts reached a return of {threshold:g} in "
-            f"{options.steps} steps; give them more steps (--experts.steps) or seeds"
+            f"{options.steps} steps; give them more steps (--experts.steps) or seeds, "
+            "and the run another folder"
         )
     actors = jax.tree.map(lambda leaf: jnp.asarray(leaf[chosen]), result.final)
     per_expert = -(-options.trajectories // chosen.size)

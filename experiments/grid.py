@@ -19,6 +19,7 @@ from cmedirl_jax.hot_start import HotStartData
 from cmedirl_jax.methods import METHODS, Method, Settings
 from experiments import (
     cells,
+    clerk,
     compilation,
     conclusion,
     distributed,
@@ -70,7 +71,9 @@ class _Session(NamedTuple):
             self.identity,
             every=self.grid.checkpoint_every,
             interruption=self.interruption,
-            say=lambda line: self.console.print(line, highlight=False, soft_wrap=True),
+            say=functools.partial(
+                self.console.print, markup=False, highlight=False, soft_wrap=True
+            ),
         )
 
 
@@ -160,7 +163,8 @@ def _train_cells(session: _Session, given: Demonstrations | None, todo: list[Cel
     with reporter(session.console, len(todo) + trains_experts, total) as report:
         if trains_experts:
             report.start(f"experts, {grid.experts.seeds} seeds")
-            pool = _train_experts(session, compiled, report)
+            with session.keeper("experts") as keeper:
+                pool = _train_experts(session, compiled, keeper, report)
         data, metadata = None, {}
         if pool is not None:
             planning.check_enough(grid, int(pool.episode[-1]) + 1)
@@ -169,14 +173,18 @@ def _train_cells(session: _Session, given: Demonstrations | None, todo: list[Cel
             metadata = pool.metadata
         if pool is not None and distributed.is_writer():
             _keep(pool, planning.pool_path(grid))
+            shutil.rmtree(grid.folder / "checkpoints" / "experts", ignore_errors=True)
         for cell in todo:
             if session.interruption.came():
                 session.interruption.stop()
             report.start(f"{cell.name}, {grid.seeds} seeds")
-            _train_cell(session, compiled, cell, data, metadata, report)
+            with session.keeper(cell.name) as keeper:
+                _train_cell(session, compiled, keeper, cell, data, metadata, report)
 
 
-def _train_experts(session: _Session, compiled: _Compiled, report: Reporter) -> Demonstrations:
+def _train_experts(
+    session: _Session, compiled: _Compiled, keeper: Keeper, report: Reporter
+) -> Demonstrations:
     grid = session.grid
     return experts.make_pool(
         session.keys.experts,
@@ -185,7 +193,7 @@ def _train_experts(session: _Session, compiled: _Compiled, report: Reporter) -> 
         grid.expert,
         compiled.method(METHODS["ddpg"], Settings()),
         _stepwise(report, grid.experts.seeds),
-        session.keeper("experts"),
+        keeper,
     )
 
 
@@ -198,6 +206,7 @@ def _keep(pool: Demonstrations, path: Path) -> None:
 def _train_cell(
     session: _Session,
     compiled: _Compiled,
+    keeper: Keeper,
     cell: Cell,
     data: HotStartData | None,
     metadata: dict[str, Any],
@@ -205,7 +214,6 @@ def _train_cell(
 ) -> None:
     """Train a cell, judge its policies, and write what came of it."""
     grid, env, keys, budget = session.grid, session.env, session.keys, session.budget
-    keeper = session.keeper(cell.name)
     if cell.method.tabular is None or cell.method.interacts:
         programs = compiled.method(cell.method, grid.settings)
         result = cells.train(
@@ -245,10 +253,12 @@ def _train_cell(
     )
     if distributed.is_writer():
         keeper.wait()
-        save = functools.partial(distributed.alone, checkpoint.save)
-        save(grid.folder / "policies" / cell.name, result.best)
-        if result.reward is not None:
-            save(grid.folder / "rewards" / cell.name, result.reward)
+        for name, tree in (("policies", result.best), ("rewards", result.reward)):
+            path = grid.folder / name / cell.name
+            # What a process left that was killed here before, whole or not.
+            shutil.rmtree(path, ignore_errors=True)
+            if tree is not None:
+                clerk.call(checkpoint.save, path, tree)
         results.append(grid.folder, rows)
         keeper.remove()
 

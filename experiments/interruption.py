@@ -1,6 +1,7 @@
 """SIGINT and SIGTERM, noted while a run works and obeyed where it can go on from."""
 
 import contextlib
+import os
 import signal
 import time
 from collections.abc import Iterator
@@ -46,8 +47,12 @@ class Interruption:
 
 
 @contextlib.contextmanager
-def noted() -> Iterator[Interruption]:
-    """Note the first SIGINT or SIGTERM of this block; a later one acts as it would without it."""
+def noted(notice: str | None = None) -> Iterator[Interruption]:
+    """Note the first SIGINT or SIGTERM of this block; a later one acts as it would without it.
+
+    Args:
+        notice: written to standard output at the first.
+    """
     interruption, first = Interruption(), 0.0
     before = {number: signal.getsignal(number) for number in SIGNALS}
 
@@ -59,6 +64,9 @@ def noted() -> Iterator[Interruption]:
         nonlocal first
         if interruption.signal is None:
             interruption.signal, first = number, time.monotonic()
+            if notice is not None:
+                # `print` may be what the signal interrupts.
+                os.write(1, notice.encode())
         elif time.monotonic() - first >= TWICE:
             restore()
             signal.raise_signal(number)

@@ -67,9 +67,11 @@ def supervise(arguments: Sequence[str]) -> int:
     code = child.wait()
     if code == -signal.SIGABRT:
         print(GONE, file=sys.stderr)
-    elif code < 0:
-        print(f"run_grid: ended by signal {-code}", file=sys.stderr)
-    return 1 if code < 0 else code
+        return 1
+    if code < 0:
+        print(f"run_grid: ended by {signal.Signals(-code).name}", file=sys.stderr)
+        return 128 - code
+    return code
 
 
 def is_worker() -> bool:

@@ -86,8 +86,6 @@ class _Plain:
 
     def go_on(self, learning_steps: int) -> None:
         self.total -= learning_steps
-        if learning_steps:
-            self._print(f"{self.name} goes on from its checkpoint")
 
     def advance(self, learning_steps: int, solved_fraction: float) -> None:
         self.done += learning_steps

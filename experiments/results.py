@@ -101,12 +101,14 @@ def opened(grid: Grid) -> Iterator[Path]:
     before = set(folder.iterdir())
     with _held(folder):
         try:
+            # Once more: another process may have been here since.
+            check_folder(grid)
             _clean(folder)
             _configure(grid)
             yield folder
         except UserError:
             new = set(folder.iterdir()) - before
-            if folder / "evaluations.parquet" not in new:
+            if not (folder / "evaluations.parquet").exists():
                 for path in new:
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
                 for path in made:
@@ -122,6 +124,8 @@ def _held(folder: Path) -> Iterator[None]:
         lock.acquire(blocking=False)
     except filelock.Timeout as error:
         raise UserError(f"--out: another process is at work in {folder}") from error
+    except OSError as error:
+        raise UserError(f"--out: cannot lock {folder / _LOCK} ({error.strerror})") from error
     try:
         yield
     finally:
@@ -168,6 +172,7 @@ def _compare(path: Path, config: dict[str, Any]) -> None:
     try:
         written = json.loads(path.read_text())
         schema, before = written["schema"], _flat(written["config"])
+        dict(written["versions"])
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"--out: {path} is not a readable configuration ({error})") from error
     if schema != SCHEMA:
@@ -230,6 +235,9 @@ def replacing(path: Path) -> Iterator[Path]:
     partial = path.with_name(f".{path.name}.partial")
     try:
         yield partial
+        # Or a power cut might leave the name without the content.
+        with partial.open("rb+") as file:
+            os.fsync(file.fileno())
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)

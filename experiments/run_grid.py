@@ -14,12 +14,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from experiments import compilation, distributed, interruption, planning, processes
+from experiments import compilation, distributed, interruption, processes
 from experiments import grid as grid_lib
 from experiments.errors import UserError
 from experiments.interruption import Interrupted
 from experiments.presets import PRESETS, Grid
 
+_STOPPING = "Stopping after this chunk of steps; once more to stop at once\n"
 _CONTINUE = "start the same command again to go on"
 
 
@@ -48,8 +49,7 @@ def work(grid: Grid) -> int:
         # Before anything else: the first array that JAX makes fixes the number of CPU devices.
         devices = start_devices(grid)
         console.quiet = not distributed.is_writer()
-        planning.check(grid)
-        with interruption.noted() as signals:
+        with interruption.noted(None if console.quiet else _STOPPING) as signals:
             summary = grid_lib.run(grid, devices, console, signals)
     except UserError as error:
         return _end(2, str(error))
@@ -66,7 +66,9 @@ def work(grid: Grid) -> int:
     console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
     if summary["diverged"].sum():
         console.print(f"Seeds that diverged and were stopped: {summary['diverged'].sum()}")
-    console.print(f"Tables and figures: {grid.folder}", highlight=False, soft_wrap=True)
+    console.print(
+        f"Tables and figures: {grid.folder}", markup=False, highlight=False, soft_wrap=True
+    )
     return 0
 
 
@@ -113,7 +115,9 @@ def start_devices(grid: Grid) -> list[jax.Device]:
         raise UserError(f"--devices: {grid.devices} asked, {there}")
     if processes.is_asked(grid):
         distributed.check_same(grid)
-        return distributed.devices(grid.devices, grid.seeds)
+        shared = distributed.devices(grid.devices, grid.seeds)
+        distributed.connect(shared)
+        return shared
     return devices[: max(grid.devices, 1)] if grid.devices is not None else devices
 
 

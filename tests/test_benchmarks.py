@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import measuring, naive, ours, peers, plots, seeds_per_second
+from benchmarks import measuring, naive, ours, peers, plots, scaling, seeds_per_second
 from benchmarks.measuring import Record
 from benchmarks.peers import PEERS
 from benchmarks.serving import Worker
@@ -283,3 +283,15 @@ def test_workloads_are_plain_data():
     workload = Workload(method="me-ddpg", hidden=(400, 300))
     options = json.loads(json.dumps(dataclasses.asdict(workload)))
     assert Workload(**{**options, "hidden": tuple(options["hidden"])}) == workload
+
+
+def test_a_process_of_the_scaling_benchmark_times_its_turns():
+    job = {"method": "ddpg", "seeds_count": 1, "devices": 1, "coordinator": "", "processes": 1}
+    worker = scaling.start(job | {"index": 0})
+    try:
+        times = scaling.turn([worker])
+    finally:
+        worker.kill()
+        worker.communicate()
+    assert times["chunk_s"] > 0.0
+    assert times["gather_bytes"] == 5_000

@@ -1,13 +1,14 @@
 import dataclasses
 import itertools
 import signal
+import threading
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import pytest
 
-from cmedirl_jax import hot_start, training
+from cmedirl_jax import checkpoint, hot_start, training
 from cmedirl_jax.ddpg import DDPGHParams
 from cmedirl_jax.methods import METHODS, Settings
 from cmedirl_jax.networks import Architecture
@@ -399,12 +400,14 @@ def test_a_cell_ends_when_every_seed_has_diverged(programs):
     assert len(trained.result.evaluations) == 1
 
 
+def assert_whole(line):
+    assert "goes on from its checkpoint at step" in line
+
+
 def keeper(folder, *, stop_after=None):
     """Saves every chunk; a signal comes during the chunk that follows `stop_after` others."""
     interruption = Interruption()
-    keeper = Keeper(
-        folder, {}, every=0.0, interruption=interruption, say=lambda line: pytest.fail(line)
-    )
+    keeper = Keeper(folder, {}, every=0.0, interruption=interruption, say=assert_whole)
     visit, visits = keeper.visit, itertools.count()
 
     def visit_and_count(step, take):
@@ -414,6 +417,33 @@ def keeper(folder, *, stop_after=None):
 
     keeper.visit = visit_and_count
     return keeper
+
+
+def test_training_goes_on_while_its_past_is_saved(programs, by_episodes, tmp_path, monkeypatch):
+    """A checkpoint is of its step, however far training has come when it is written."""
+    trained = threading.Event()
+    save = checkpoint.save
+
+    def save_late(*arguments):
+        assert trained.wait(60)
+        save(*arguments)
+
+    monkeypatch.setattr(checkpoint, "save", save_late)
+    keeping = keeper(tmp_path)
+    visit, visits = keeping.visit, itertools.count()
+
+    def visit_once(step, take):
+        # A seed ends in each of the chunks that follow.
+        if next(visits) == 2:
+            visit(step, take)
+
+    keeping.visit = visit_once
+    assert_same_results(train(programs, BY_EPISODES, keeper=keeping).result, by_episodes.result)
+    trained.set()
+    keeping.wait()
+    rest = train(programs, BY_EPISODES, keeper=keeper(tmp_path))
+    assert rest.chunks[0].steps[0] == 3 * CHUNK
+    assert_same_results(rest.result, by_episodes.result)
 
 
 def assert_same_results(actual, expected):

@@ -44,9 +44,9 @@ class Runs:
         program = (sys.executable, "-m", "experiments.run_grid")
         return (*program, *RUN, "--demos", str(self.demos), "--out", str(out))
 
-    def start(self, out, *prefix, **environment):
+    def start(self, out, *options, prefix=(), **environment):
         return subprocess.Popen(
-            (*prefix, *self.command(out)),
+            (*prefix, *self.command(out), *options),
             cwd=ROOT,
             env=self.environment | environment,
             stdout=subprocess.PIPE,
@@ -54,9 +54,9 @@ class Runs:
             text=True,
         )
 
-    def finish(self, out, **environment):
+    def finish(self, out, *options):
         """Run until the end; returns what was printed."""
-        process = self.start(out, **environment)
+        process = self.start(out, *options)
         output, errors = process.communicate(timeout=LIMIT)
         assert process.returncode == 0, errors
         assert not errors
@@ -179,6 +179,19 @@ def test_a_run_may_be_killed_in_any_phase(runs, whole, tmp_path, phase):
     assert_same_run(run, whole)
 
 
+@pytest.mark.slow
+def test_a_run_may_be_killed_among_its_experts(runs, tmp_path):
+    without_demos = ("--demos", "None", "--experts.seeds", "8", "--experts.steps", "6000")
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    runs.finish(whole, *without_demos)
+    for saved in (500, 2_000):
+        process = runs.start(run, *without_demos)
+        wait_for(process, lambda saved=saved: (run / f"checkpoints/experts/{saved}").exists())
+        assert kill(process)
+    assert "experts goes on from its checkpoint" in runs.finish(run, *without_demos)
+    assert_same_run(run, whole)
+
+
 def test_a_signal_ends_a_run_with_its_code_and_a_line(runs, whole, tmp_path):
     run = tmp_path / "run"
     for number, steps in ((signal.SIGINT, 250), (signal.SIGTERM, STEPS + 250)):
@@ -222,15 +235,17 @@ needs_mount = pytest.mark.skipif(not can_mount(), reason="this user may not moun
 
 @needs_mount
 def test_a_full_disk_ends_a_run_that_goes_on_once_there_is_room(runs, whole, tmp_path):
-    """On a disk that has room for the first cell's checkpoints, not for its results."""
+    """It fills up in the second cell: checkpoints fail, then the results do."""
     disk = tmp_path / "disk"
     disk.mkdir()
     script = """
-        mount -t tmpfs -o size=2m none "$1"
-        head -c "$2" /dev/zero > "$1/filler"
-        shift 2
+        mount -t tmpfs -o size=64m none "$DISK"
+        "$@" &
+        until test -e "$DISK/run/policies/hs-me-ddpg-n1" && ls "$DISK"/run/checkpoints/*n2/[0-9]*
+        do sleep 0.01; done > /dev/null 2> /dev/null
+        dd if=/dev/zero of="$DISK/filler" 2> /dev/null || true
         status=0
-        "$@" || status=$?
+        wait $! || status=$?
         echo "status $status"
         rm "$DISK/filler"
         "$@"
@@ -238,17 +253,21 @@ def test_a_full_disk_ends_a_run_that_goes_on_once_there_is_room(runs, whole, tmp
     """
     filled = runs.start(
         disk / "run",
-        *(*ISOLATED, "bash", "-euc", script, "-", str(disk), str(2 * 2**20 - 100_000)),
+        prefix=(*ISOLATED, "bash", "-euc", script, "-"),
         DISK=str(disk),
         COPY=str(tmp_path / "copy"),
     )
     output, errors = filled.communicate(timeout=LIMIT)
     assert filled.returncode == 0, errors
-    assert "status 1" in output.splitlines()
+    before, after = output.split("status 1\n")
+    assert "no checkpoint could be saved" in before
+    assert "[2/2] hs-me-ddpg-n2" in before
     (line,) = errors.splitlines(keepends=True)
     assert line.startswith("run_grid: ")
     assert "No space left on device" in line
     assert line.endswith(CONTINUE)
+    assert "[1/1] hs-me-ddpg-n2" in after
+    assert "hs-me-ddpg-n2 goes on from its checkpoint" in after
     assert_same_run(tmp_path / "copy", whole)
 
 
@@ -257,7 +276,7 @@ def test_a_read_only_folder_is_refused(runs, tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
     script = 'mount -t tmpfs -o ro none "$1"; shift; exec "$@"'
-    refused = runs.start(disk / "run", *ISOLATED, "bash", "-euc", script, "-", str(disk))
+    refused = runs.start(disk / "run", prefix=(*ISOLATED, "bash", "-euc", script, "-", str(disk)))
     _, errors = refused.communicate(timeout=LIMIT)
     assert errors == (f"run_grid: --out: cannot write to {disk / 'run'} (Read-only file system)\n")
     assert refused.returncode == 2

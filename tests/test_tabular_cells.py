@@ -1,3 +1,5 @@
+import signal
+
 import jax
 import numpy as np
 import pytest
@@ -7,6 +9,8 @@ from cmedirl_jax.methods import METHODS, Settings
 from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.imitation import TabularSettings
 from experiments import tabular_cells
+from experiments.checkpoints import Keeper
+from experiments.interruption import Interrupted, Interruption
 from tests import pools
 
 SETTINGS = Settings(tabular=TabularSettings(states=9, actions=3, steps=2, centres=3))
@@ -24,10 +28,16 @@ def programs(env):
     )
 
 
-def train(programs, seeds_count, n_demos=2):
+def train(programs, seeds_count, n_demos=2, keeper=None):
     data = hot_start.data(pools.scripted())
     return tabular_cells.train(
-        programs, jax.random.key(3), data, n_demos, seeds_count=seeds_count, evaluation_starts=2
+        programs,
+        jax.random.key(3),
+        data,
+        n_demos,
+        seeds_count=seeds_count,
+        evaluation_starts=2,
+        keeper=keeper,
     )
 
 
@@ -48,6 +58,32 @@ def test_one_evaluation_of_the_greedy_policy_and_one_of_the_soft(result, program
     alone = evaluation.evaluate(act, env, params, 2)
     np.testing.assert_allclose(greedy.evaluation.return_mean[1], alone.return_mean, rtol=1e-5)
     assert (greedy.evaluation.return_mean != soft.evaluation.return_mean).any()
+
+
+@pytest.mark.parametrize("fitted", [1, 2])
+def test_a_cell_that_was_stopped_goes_on_with_the_seeds_that_are_left(
+    result, programs, tmp_path, fitted
+):
+    interruption, calls = Interruption(), []
+
+    def fit(*arguments):
+        if len(calls) + 1 == fitted and not calls[1:]:
+            interruption.signal = signal.SIGTERM
+        calls.append(arguments)
+        return programs.fit(*arguments)
+
+    def keeper(interruption):
+        return Keeper(
+            tmp_path / "cell", {}, every=0.0, interruption=interruption, say=lambda line: None
+        )
+
+    listening = programs._replace(fit=fit)
+    with pytest.raises(Interrupted):
+        train(listening, SEEDS, keeper=keeper(interruption))
+    assert len(calls) == fitted
+    found = train(programs, SEEDS, keeper=keeper(Interruption()))
+    for actual, expected in zip(jax.tree.leaves(found), jax.tree.leaves(result), strict=True):
+        np.testing.assert_array_equal(actual, expected)
 
 
 def test_no_environment_step_is_taken_beyond_the_demonstrations(result):
