@@ -262,8 +262,9 @@ def test_a_full_disk_ends_a_run_that_goes_on_once_there_is_room(runs, whole, tmp
     before, after = output.split("status 1\n")
     assert "no checkpoint could be saved" in before
     assert "[2/2] hs-me-ddpg-n2" in before
-    (line,) = errors.splitlines(keepends=True)
-    assert line.startswith("run_grid: ")
+    # Where the disk fills up under orbax's hands, it complains too.
+    lines = errors.splitlines(keepends=True)
+    (line,) = [line for line in lines if line.startswith("run_grid: ")]
     assert "No space left on device" in line
     assert line.endswith(CONTINUE)
     assert "[1/1] hs-me-ddpg-n2" in after
