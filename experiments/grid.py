@@ -21,7 +21,6 @@ from experiments import (
     cells,
     clerk,
     compilation,
-    conclusion,
     distributed,
     experts,
     gymnasium_replay,
@@ -137,6 +136,9 @@ def run(
         if not distributed.is_writer():
             return None
         shutil.rmtree(grid.folder / "checkpoints", ignore_errors=True)
+        # Matplotlib and scipy take a second to import, which a refusal need not wait for.
+        from experiments import conclusion
+
         return conclusion.conclude(grid, env, plan, redraw=bool(todo))
 
 
