@@ -1,3 +1,7 @@
+import os
+
+import os
+
 import hypothesis
 import jax
 import numpy as np
@@ -57,3 +61,13 @@ def skewed_spec():
         max_episode_steps=10,
         reward_threshold=0.0,
     )
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """Environment variables that make a module's commands compile quickly, and share the result."""
+    return {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {compiling.QUICK_COMMANDS}",
+    }

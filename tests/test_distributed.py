@@ -15,7 +15,7 @@ from polars.testing import assert_frame_equal
 from cmedirl_jax import checkpoint, demonstrations
 from experiments import clerk, distributed, processes, results, run_grid
 from experiments.errors import UserError
-from tests import compiling, pools
+from tests import pools
 
 ROOT = Path(__file__).parents[1]
 PROCESSES = 2
@@ -118,16 +118,6 @@ class Processes:
 
     def output(self, index):
         return self.outputs[index].read_text()
-
-
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory):
-    """Environment variables that make runs of this module share what they compile."""
-    return {
-        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {compiling.QUICK_COMMANDS}",
-    }
 
 
 @pytest.fixture(scope="module")

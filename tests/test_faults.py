@@ -1,6 +1,7 @@
 """Runs that are killed, stopped, started twice or out of disk, as real processes."""
 
 import contextlib
+import glob
 import os
 import random
 import shutil
@@ -16,7 +17,7 @@ from polars.testing import assert_frame_equal
 
 from cmedirl_jax import demonstrations
 from experiments import results
-from tests import compiling, pools
+from tests import pools
 
 ROOT = Path(__file__).parents[1]
 STEPS = 1500
@@ -64,17 +65,8 @@ class Runs:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs")
-    return Runs(
-        folder,
-        os.environ
-        | {
-            "JAX_COMPILATION_CACHE_DIR": str(folder / "compiled"),
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-            "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {compiling.QUICK_COMMANDS}",
-        },
-    )
+def runs(tmp_path_factory, compiled):
+    return Runs(tmp_path_factory.mktemp("runs"), os.environ | compiled)
 
 
 @pytest.fixture(scope="module")
@@ -100,10 +92,17 @@ def assert_same_run(folder, whole):
     }
 
 
+def paths(run, pattern):
+    """What there is; `Path.glob` trips over folders that vanish meanwhile."""
+    return [Path(path) for path in glob.glob(str(run / pattern))]
+
+
 def progress(run):
     """Steps behind the cells of a run, as far as they are saved."""
-    finished = [path.name for path in run.glob("policies/*[0-9]")]
-    begun = [path for path in run.glob("checkpoints/*/[0-9]*") if path.parent.name not in finished]
+    finished = [path.name for path in paths(run, "policies/*[0-9]")]
+    begun = [
+        path for path in paths(run, "checkpoints/*/[0-9]*") if path.parent.name not in finished
+    ]
     return STEPS * len(finished) + max((int(path.name) for path in begun), default=0)
 
 
@@ -137,7 +136,7 @@ def test_a_run_that_was_killed_three_times_is_as_one_that_never_was(runs, whole,
 
 def written_since(moment, run, pattern):
     """Whether a path of the run was made or changed after `moment`."""
-    for path in run.glob(pattern):
+    for path in paths(run, pattern):
         with contextlib.suppress(FileNotFoundError):
             if path.stat().st_mtime > moment:
                 return True
@@ -211,6 +210,8 @@ def test_a_second_process_is_refused_and_a_crash_frees_the_folder(runs, whole, t
     wait_for(first, lambda: progress(run) >= 250)
     first.send_signal(signal.SIGSTOP)
     try:
+        # Its other threads may still be on their way to a halt.
+        time.sleep(0.5)
         before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
         second = runs.start(run)
         _, errors = second.communicate(timeout=LIMIT)

@@ -15,7 +15,7 @@ from cmedirl_jax import checkpoint, demonstrations
 from cmedirl_jax.methods import METHODS
 from experiments import experts, grid, results, run_grid
 from experiments.errors import UserError
-from tests import compiling, pools
+from tests import pools
 
 ROOT = Path(__file__).parents[1]
 SMOKE = ("--preset", "smoke")
@@ -256,16 +256,6 @@ def test_a_mistake_ends_the_process_with_code_2_and_one_line(tmp_path):
     assert done.stdout == ""
     assert done.stderr == "run_grid: --seeds: must be at least 1, got 0\n"
     assert not any(tmp_path.iterdir())
-
-
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory):
-    """Environment variables that make runs of this module share what they compile."""
-    return {
-        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {compiling.QUICK_COMMANDS}",
-    }
 
 
 @pytest.fixture(scope="module")
