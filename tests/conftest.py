@@ -1,7 +1,5 @@
 import os
 
-import os
-
 import hypothesis
 import jax
 import numpy as np
