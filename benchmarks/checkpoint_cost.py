@@ -12,10 +12,9 @@ import jax
 import tyro
 from rich.console import Console
 
-from benchmarks import measuring
-from cmedirl_jax import envs, seeds
-from cmedirl_jax.methods import METHODS, Settings
-from experiments import cells, checkpoints, compilation, judging, programs
+from benchmarks import measuring, ours
+from cmedirl_jax.methods import Settings
+from experiments import cells, checkpoints, compilation
 from experiments.bookkeeping import Budget
 from experiments.checkpoints import Keeper
 from experiments.interruption import Interruption
@@ -58,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = tyro.cli(Options, prog="python -m benchmarks.checkpoint_cost", args=arguments)
     compilation.use_cache()
     jax.config.update("jax_num_cpu_devices", max(1, measuring.cores()))
-    compiled = _compile(options)
+    compiled = ours.compile_programs("ddpg", Settings(), jax.devices(), seeds_count=options.seeds)
     result = measuring.heading("checkpoint_cost") | _measure(options, compiled)
     console = Console()
     console.print(
@@ -72,24 +71,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.json is not None:
         measuring.write(result, options.json)
     return 0
-
-
-def _compile(options: Options) -> Programs:
-    env, settings, devices = envs.make(Grid.env), Settings(), jax.devices()
-    hidden = settings.architecture.hidden
-    group = seeds.group_size(options.seeds, len(devices), hidden)
-    return programs.compile_method(
-        env,
-        METHODS["ddpg"],
-        settings,
-        judging.of_networks(env, settings.architecture, group, devices),
-        programs.compile_networks(env, settings.architecture, group, devices),
-        group=group,
-        seeds_count=options.seeds,
-        devices=devices,
-        capacity=Grid.max_steps or options.steps,
-        subset_size=None,
-    )
 
 
 def _measure(options: Options, compiled: Programs) -> dict[str, object]:

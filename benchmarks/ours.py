@@ -16,11 +16,11 @@ from cmedirl_jax.schedules import RewardSchedule, Schedule
 from experiments import judging
 from experiments import programs as programs_lib
 from experiments.lanes import Lanes
+from experiments.programs import Programs
 
 
 def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
     """A function that takes so many steps with every seed, compiled by its first call."""
-    env = envs.make("MountainCarContinuous-v0")
     settings = Settings(
         architecture=Architecture(
             hidden=workload.hidden,
@@ -36,18 +36,12 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
             batch_size=workload.batch, learning_starts=0, behaviour_cloning_steps=10**9
         ),
     )
-    devices = jax.devices()[: workload.devices]
-    group = workload.group or seeds.group_size(workload.seeds, len(devices), workload.hidden)
-    programs = programs_lib.compile_method(
-        env,
-        METHODS[workload.method],
+    programs = compile_programs(
+        workload.method,
         settings,
-        judging.of_networks(env, settings.architecture, group, devices),
-        programs_lib.compile_networks(env, settings.architecture, group, devices),
-        group=group,
+        jax.devices()[: workload.devices],
         seeds_count=workload.seeds,
-        devices=devices,
-        capacity=CAPACITY,
+        group=workload.group,
         subset_size=workload.n_demos,
     )
     data = hot_start.data(pool) if METHODS[workload.method].uses_demonstrations else None
@@ -66,3 +60,29 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         taken += steps
 
     return advance
+
+
+def compile_programs(
+    method: str,
+    settings: Settings,
+    devices: list[jax.Device],
+    *,
+    seeds_count: int,
+    group: int | None = None,
+    subset_size: int | None = None,
+) -> Programs:
+    """One method's programs, with the main job's replay; `group` None for the library's choice."""
+    env, architecture = envs.make("MountainCarContinuous-v0"), settings.architecture
+    group = group or seeds.group_size(seeds_count, len(devices), architecture.hidden)
+    return programs_lib.compile_method(
+        env,
+        METHODS[method],
+        settings,
+        judging.of_networks(env, architecture, group, devices),
+        programs_lib.compile_networks(env, architecture, group, devices),
+        group=group,
+        seeds_count=seeds_count,
+        devices=devices,
+        capacity=CAPACITY,
+        subset_size=subset_size,
+    )

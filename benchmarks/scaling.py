@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from benchmarks import measuring
-from cmedirl_jax import envs, seeds
-from cmedirl_jax.methods import METHODS, Settings
-from experiments import cells, distributed, judging
+from benchmarks import measuring, ours
+from cmedirl_jax import seeds
+from cmedirl_jax.methods import Settings
+from experiments import cells, distributed
 from experiments import programs as programs_lib
 from experiments.lanes import Lanes
 
@@ -126,14 +126,7 @@ def work(
         jax.distributed.initialize(coordinator, processes, index)
     spread_over = distributed.devices(devices, seeds_count)
     distributed.connect(spread_over)
-    env, settings = envs.make("MountainCarContinuous-v0"), Settings()
-    group = seeds.group_size(seeds_count, len(spread_over), settings.architecture.hidden)
-    shape = (env, settings.architecture, group, spread_over)
-    judge, draw = judging.of_networks(*shape), programs_lib.compile_networks(*shape)
-    sizes = {"group": group, "seeds_count": seeds_count, "capacity": 12_000, "subset_size": 1}
-    programs = programs_lib.compile_method(
-        env, METHODS[method], settings, judge, draw, devices=spread_over, **sizes
-    )
+    programs = ours.compile_programs(method, Settings(), spread_over, seeds_count=seeds_count)
     lanes = Lanes(programs.lanes, seeds_count, programs.group, programs.devices)
     state = programs_lib.begin(programs, lanes, jax.random.key(0), None, 0)
     groups = lanes.groups(np.ones(seeds_count, bool))

@@ -132,7 +132,9 @@ class _Training:
     ) -> "_Training":
         training = cls(programs, data, Book(lanes.seeds, budget), lanes, state)
         every = np.arange(lanes.seeds)
-        found = training._evaluate(budget.evaluation_starts, lanes.groups(every >= 0))
+        found = training._evaluate(
+            budget.evaluation_starts, lanes.groups(np.ones(lanes.seeds, bool))
+        )
         training.best = _take(state.agent.actor, lanes.of_seed)
         training.best_return = jnp.asarray(found.return_mean)
         training.book.evaluated("steps", every, found)
