@@ -17,6 +17,7 @@ from cmedirl_jax.methods import Settings
 from experiments import cells, checkpoints, compilation
 from experiments.bookkeeping import Budget
 from experiments.checkpoints import Keeper
+from experiments.errors import UserError
 from experiments.interruption import Interruption
 from experiments.presets import Grid
 from experiments.programs import Programs
@@ -58,7 +59,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     compilation.use_cache()
     jax.config.update("jax_num_cpu_devices", max(1, measuring.cores()))
     compiled = ours.compile_programs("ddpg", Settings(), jax.devices(), seeds_count=options.seeds)
-    result = measuring.heading("checkpoint_cost") | _measure(options, compiled)
+    try:
+        measured = measure(options, compiled)
+    except UserError as error:
+        print(f"checkpoint_cost: {error}", file=sys.stderr)
+        return 2
+    result = measuring.heading("checkpoint_cost") | measured
     console = Console()
     console.print(
         f"{result['checkpoint_bytes'] / 1e6:.0f} MB a checkpoint, {result['checkpoints']} of them: "
@@ -73,7 +79,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _measure(options: Options, compiled: Programs) -> dict[str, object]:
+def measure(options: Options, compiled: Programs) -> dict[str, object]:
+    """Train the cell with and without, in turn.
+
+    Raises:
+        UserError: if it trains for less time than one checkpoint takes to fall due.
+    """
+
     def seconds(keeper: Keeper | None) -> float:
         began = time.perf_counter()
         cells.train(
@@ -104,6 +116,10 @@ def _measure(options: Options, compiled: Programs) -> dict[str, object]:
             )
             without = seconds(None)
             ratios.append(seconds(keeper) / without)
+            if not keeper.saved:
+                raise UserError(
+                    f"--every: none was due in {without:.1f} s of training; ask for more --steps"
+                )
             keepers.append(keeper)
             size = sum(path.stat().st_size for path in keeper.folder.rglob("*") if path.is_file())
             kept = len(list(keeper.folder.iterdir()))

@@ -3,6 +3,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import measuring, naive, ours, peers, plots, scaling, seeds_per_second
+from benchmarks import (
+    checkpoint_cost,
+    measuring,
+    naive,
+    ours,
+    peers,
+    plots,
+    scaling,
+    seeds_per_second,
+)
 from benchmarks.measuring import Record
 from benchmarks.peers import PEERS
 from benchmarks.serving import Worker
 from benchmarks.workload import Workload
 from cmedirl_jax.methods import PAPER_METHODS
 from experiments import programs
+from experiments.errors import UserError
 from tests import pools
 
 TINY = {"seeds": 3, "hidden": (4, 4), "batch": 4}
@@ -295,3 +306,33 @@ def test_a_process_of_the_scaling_benchmark_times_its_turns():
         worker.communicate()
     assert times["chunk_s"] > 0.0
     assert times["gather_bytes"] == 5_000
+
+
+@pytest.fixture
+def fake_training(monkeypatch):
+    """A cell of ten chunks, a hundredth of a second each."""
+
+    weight = np.random.default_rng(0).random(1_000)
+
+    def train(*_, keeper, **__):
+        for step in range(10):
+            time.sleep(0.01)
+            if keeper is not None:
+                keeper.visit(step, lambda: ({"weight": weight}, {"step": np.ones(1)}))
+
+    monkeypatch.setattr(checkpoint_cost.cells, "train", train)
+
+
+def test_checkpoints_are_counted_and_their_cost_is_of_the_time_without(fake_training):
+    options = checkpoint_cost.Options(every=0.03, rounds=3)
+    found = checkpoint_cost.measure(options, compiled=None)
+    assert 3 <= found["checkpoints"] <= 3 * 4
+    assert 8_000 <= found["checkpoint_bytes"] < 20_000
+    assert found["cost_low"] <= found["cost"] <= found["cost_high"]
+    assert found["cost_by_default"] == pytest.approx(found["cost"] * 0.03 / 60)
+    assert found["blocked_seconds"] > 0.0
+
+
+def test_a_run_too_short_for_a_checkpoint_says_so(fake_training):
+    with pytest.raises(UserError, match=r"--every: none was due .* ask for more --steps"):
+        checkpoint_cost.measure(checkpoint_cost.Options(every=60.0), compiled=None)
