@@ -14,7 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from experiments import compilation, distributed, interruption, processes
+from experiments import compilation, distributed, heap, interruption, processes
 from experiments import grid as grid_lib
 from experiments.errors import UserError
 from experiments.interruption import Interrupted
@@ -44,6 +44,7 @@ def work(grid: Grid) -> int:
     console = Console()
     if not console.is_terminal:
         console = Console(width=120)
+    heap.share(arenas=cores())
     compilation.use_cache()
     try:
         # Before anything else: the first array that JAX makes fixes the number of CPU devices.
