@@ -121,6 +121,8 @@ def _undamaged(folder: Path) -> Iterator[None]:
     """Turn whatever json, polars or numpy stumble over in a damaged file into a user's error."""
     try:
         yield
+    except UserError:
+        raise
     except (Exception, pl.exceptions.PanicException) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise UserError(f"{folder}: holds a damaged file ({reason})") from error
@@ -137,15 +139,14 @@ def holm(p_values: np.ndarray) -> np.ndarray:
 
 def _seed_statistics(folder: Path, threshold: float) -> dict[tuple[str, int], SeedStatistics]:
     """Of every cell whose method acts, its seeds' statistics."""
-    evaluations, seeds = (results.read(folder, name) for name in ("evaluations", "seeds"))
-    assert evaluations is not None
-    assert seeds is not None
+    tables = results.read(folder)
     by_cell = ["method", "n_demos"]
     diverged = {
-        key: group.sort("seed")["diverged"].to_numpy() for key, group in seeds.group_by(by_cell)
+        key: group.sort("seed")["diverged"].to_numpy()
+        for key, group in tables["seeds"].group_by(by_cell)
     }
     found = {}
-    for key, group in evaluations.group_by(by_cell, maintain_order=True):
+    for key, group in tables["evaluations"].group_by(by_cell, maintain_order=True):
         if group["env_step"].max() != 0:
             found[key] = statistics.of_seeds(group, diverged[key], threshold)
     return found

@@ -4,7 +4,7 @@ import polars as pl
 
 from cmedirl_jax import demonstrations
 from cmedirl_jax.envs import Env
-from experiments import figures, planning, results, statistics
+from experiments import figures, kept_pool, results, statistics
 from experiments.planning import Cell
 from experiments.presets import Grid
 
@@ -12,13 +12,8 @@ from experiments.presets import Grid
 def conclude(grid: Grid, env: Env, plan: list[Cell], *, redraw: bool) -> pl.DataFrame:
     """Summarise the run's tables; draw its figures where they are not there yet."""
     folder = grid.folder
-    loaded = {name: results.read(folder, name) for name in results.TABLES}
-    evaluations, seed_rows, episodes = (
-        loaded[name] for name in ("evaluations", "seeds", "episodes")
-    )
-    assert evaluations is not None
-    assert seed_rows is not None
-    assert episodes is not None
+    tables = results.read(folder)
+    evaluations = tables["evaluations"]
 
     def of(table: pl.DataFrame, cell: Cell) -> pl.DataFrame:
         return table.filter(
@@ -29,7 +24,7 @@ def conclude(grid: Grid, env: Env, plan: list[Cell], *, redraw: bool) -> pl.Data
         [
             statistics.summarise(
                 of(evaluations, cell),
-                of(seed_rows, cell),
+                of(tables["seeds"], cell),
                 env.spec.reward_threshold,
                 grid.max_episodes,
                 interacts=cell.method.interacts,
@@ -38,13 +33,18 @@ def conclude(grid: Grid, env: Env, plan: list[Cell], *, redraw: bool) -> pl.Data
         ],
         infer_schema_length=None,
     )
-    if redraw or not (folder / "summary.csv").exists():
+    if redraw or not all((folder / name).exists() for name in ("summary.csv", "figures")):
         expert = None
-        pool = planning.reusable_demonstrations(grid, env)
+        pool = kept_pool.load(folder, env)
         if pool is not None:
             expert = float(demonstrations.returns(pool).mean())
         figures.draw(
-            folder / "figures", evaluations, episodes, summary, expert, env.spec.reward_threshold
+            folder / "figures",
+            evaluations,
+            tables["episodes"],
+            summary,
+            expert,
+            env.spec.reward_threshold,
         )
         with results.replacing(folder / "summary.csv") as partial:
             summary.write_csv(partial)

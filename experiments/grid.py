@@ -4,15 +4,14 @@ import contextlib
 import dataclasses
 import functools
 import shutil
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
 import polars as pl
 from rich.console import Console
 
-from cmedirl_jax import checkpoint, demonstrations, envs, hot_start
+from cmedirl_jax import checkpoint, envs, hot_start
 from cmedirl_jax.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.hot_start import HotStartData
@@ -25,14 +24,17 @@ from experiments import (
     experts,
     gymnasium_replay,
     judging,
+    kept_pool,
     planning,
     results,
+    run_folder,
     tables,
     tabular_cells,
 )
 from experiments import programs as programs_lib
 from experiments.bookkeeping import Budget
 from experiments.checkpoints import Keeper
+from experiments.errors import UserError
 from experiments.interruption import Interruption
 from experiments.planning import Cell
 from experiments.presets import Grid
@@ -102,11 +104,11 @@ def run(
     with contextlib.ExitStack() as stack:
 
         def enter() -> dict[str, Any]:
-            folder = stack.enter_context(results.opened(grid))
+            folder = stack.enter_context(run_folder.opened(grid))
             return {
                 "finished": [list(cell) for cell in results.finished(folder)],
-                "identity": results.identity(grid),
-                "began": results.other_versions(folder),
+                "identity": run_folder.identity(grid),
+                "began": run_folder.other_versions(folder),
             }
 
         found = distributed.from_writer(enter)
@@ -126,7 +128,7 @@ def run(
                 interruption,
                 found["identity"],
             )
-            with compilation.counted() as cost:
+            with compilation.counted() as cost, _within_memory():
                 _train_cells(session, given, todo)
             console.print(
                 f"Compilation took {cost.seconds:.1f} s; {cost.hits} programs came from the cache, "
@@ -142,11 +144,23 @@ def run(
         return conclusion.conclude(grid, env, plan, redraw=bool(todo))
 
 
+@contextlib.contextmanager
+def _within_memory() -> Iterator[None]:
+    try:
+        yield
+    except (MemoryError, jax.errors.JaxRuntimeError) as error:
+        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+            raise UserError(
+                "the machine's memory is too small for this; give fewer --seeds, --max-steps or "
+                "--evaluation-starts, or smaller networks"
+            ) from error
+        raise
+
+
 def _train_cells(session: _Session, given: Demonstrations | None, todo: list[Cell]) -> None:
     grid, env, budget = session.grid, session.env, session.budget
-    pool = given
-    if pool is None:
-        pool = distributed.pool_from_writer(lambda: planning.reusable_demonstrations(grid, env))
+    kept = distributed.pool_from_writer(lambda: kept_pool.load(grid.folder, env))
+    pool = kept if given is None else given
     trains_experts = pool is None and any(cell.n_demos for cell in todo)
     learners = grid.seeds * sum(cell.method.interacts for cell in todo)
     total = learners * budget.max_steps + grid.experts.seeds * grid.experts.steps * trains_experts
@@ -174,7 +188,8 @@ def _train_cells(session: _Session, given: Demonstrations | None, todo: list[Cel
             data = hot_start.data(pool, agent.discount, agent.reward_scale)
             metadata = pool.metadata
         if pool is not None and distributed.is_writer():
-            _keep(pool, planning.pool_path(grid))
+            if kept is None:
+                kept_pool.save(grid.folder, pool)
             shutil.rmtree(grid.folder / "checkpoints" / "experts", ignore_errors=True)
         for cell in todo:
             if session.interruption.came():
@@ -197,12 +212,6 @@ def _train_experts(
         _stepwise(report, grid.experts.seeds),
         keeper,
     )
-
-
-def _keep(pool: Demonstrations, path: Path) -> None:
-    if not path.exists():
-        path.parent.mkdir(exist_ok=True)
-        demonstrations.save(path, pool)
 
 
 def _train_cell(

@@ -1,6 +1,5 @@
 """What a run will do, and whether it can: cells, budget, and every refusal before any work."""
 
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -69,6 +68,8 @@ def check(grid: Grid) -> None:
         values = getattr(grid, name)
         if not values or len(set(values)) < len(values):
             raise UserError(f"--{name.replace('_', '-')}: give one or more, each once")
+    if grid.demos is not None and not str(grid.demos).isprintable():
+        raise UserError(f"--demos: {str(grid.demos)!r} cannot be printed; give a plainer name")
     if grid.max_steps is None and grid.max_episodes is None:
         raise UserError("--max-steps: give a number, or give --max-episodes")
     bounds.check(grid)
@@ -119,28 +120,17 @@ def load_demonstrations(grid: Grid, env: Env) -> Demonstrations:
         raise UserError(f"--demos: {grid.demos}: {error.strerror}") from error
     except ValueError as error:
         raise UserError(f"--demos: {error}") from error
+    # The tables have a column of each.
+    expert = pool.metadata.get("expert", "")
+    if not isinstance(expert, str):
+        raise UserError(f"--demos: {grid.demos}: expert in its metadata is {expert!r}, no text")
+    steps = pool.metadata.get("expert_env_steps", 0)
+    if type(steps) is not int or not 0 <= steps < 2**63:
+        raise UserError(
+            f"--demos: {grid.demos}: expert_env_steps in its metadata is {steps!r}, no count"
+        )
     check_enough(grid, int(pool.episode[-1]) + 1)
     return pool
-
-
-def pool_path(grid: Grid) -> Path:
-    """Where a run keeps its demonstrations."""
-    return grid.folder / "demonstrations" / "pool.npz"
-
-
-def reusable_demonstrations(grid: Grid, env: Env) -> Demonstrations | None:
-    """Those that the run has already, or None.
-
-    Raises:
-        UserError: if they are damaged.
-    """
-    path = pool_path(grid)
-    if not path.exists():
-        return None
-    try:
-        return demonstrations.load(path, env.spec)
-    except (OSError, ValueError) as error:
-        raise UserError(f"--out: {error}; remove it to train the experts again") from error
 
 
 def check_enough(grid: Grid, held: int) -> None:

@@ -1,6 +1,7 @@
 """What a run is: its configuration, and the three named ones."""
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -83,7 +84,9 @@ class Grid:
     @property
     def folder(self) -> Path:
         """Where the results go."""
-        return self.out if self.out is not None else Path("results") / self.preset
+        out = self.out if self.out is not None else Path("results") / self.preset
+        # Or making a/../b would make a.
+        return Path(os.path.normpath(out))
 
 
 # What section 4.1 and Algorithms 1 and 2 state. What they leave open keeps the tuned value.

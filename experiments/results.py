@@ -1,267 +1,150 @@
-"""The folder of a run: which cells are finished, its tables, its policies.
+"""The tables of a run, which hold its finished cells.
 
-A finished cell is one whose rows are in all tables; evaluations.parquet is written last, and every
-table is replaced whole, so a run that was cut off leaves only finished cells behind.
+A cell is finished once its rows are in all tables. These are replaced one by one, each as a whole;
+tables.json, written before them, has the digests of what was there and of what comes, so that a run
+which was cut off in between is told from one whose files were damaged or changed.
 """
 
 import contextlib
-import dataclasses
 import hashlib
-import importlib.metadata
 import io
 import json
-import math
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import filelock
 import polars as pl
 
 from experiments.errors import UserError
-from experiments.presets import Grid
 
 SCHEMA = 1
-PACKAGES = (
-    *("cmedirl-jax", "jax", "jaxlib", "flax", "optax"),
-    *("chex", "gymnasium", "numpy", "orbax-checkpoint"),
-)
 TABLES = ("seeds", "episodes", "evaluations")
 """In the order they are written."""
-
-COLUMNS = {
-    "seeds": (
-        *("seed", "env_steps", "episodes", "demonstration_steps", "expert_steps", "diverged"),
-        *("best_return", "gymnasium_return", "gymnasium_difference"),
-    ),
-    "episodes": ("seed", "episode", "env_step", "return"),
-    "evaluations": ("expert", "protocol", "seed", "env_step", "episode", "return_mean"),
-}
-"""What the summary and the figures read of each table, beside `method` and `n_demos`."""
-
-DAMAGED = (OSError, pl.exceptions.PolarsError, pl.exceptions.PanicException)
-"""What reading a damaged table raises; polars panics where a flipped bit breaks its assumptions."""
-
-_LOCK = ".lock"
-_NOT_COMPARED = (
-    *("out", "devices", "distributed", "coordinator", "processes", "process_id"),
-    "checkpoint_every",
-)
+FILES = ("tables.json", *(f"{name}.parquet" for name in TABLES))
 
 
-def describe(grid: Grid) -> dict[str, Any]:
-    """The fully resolved configuration as JSON values."""
-    config = dataclasses.asdict(grid)
-    if grid.demos is not None:
-        # Another file under the same name is another configuration.
-        with grid.demos.open("rb") as file:
-            config["demos_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
-    return _plain(config)
+def begun(folder: Path) -> bool:
+    """Whether a cell may be finished."""
+    return (folder / "evaluations.parquet").exists()
 
 
-def check_folder(grid: Grid) -> None:
-    """See that the run can use its folder, which need not be there yet; writes nothing.
+def read(folder: Path) -> dict[str, pl.DataFrame]:
+    """The tables of the run, with its finished cells alone; none before the first is finished.
 
     Raises:
-        UserError: if it cannot be written, or holds a run of another configuration.
+        UserError: if a table is not as it was written.
     """
-    folder = grid.folder
-    path = folder / "config.json"
-    try:
-        if path.exists():
-            _compare(path, describe(grid))
-        elif any((folder / f"{name}.parquet").exists() for name in TABLES):
-            raise UserError(f"--out: {folder} holds tables without their config.json")
-        nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-        with tempfile.TemporaryFile(dir=nearest):
-            pass
-    except OSError as error:
-        raise UserError(f"--out: cannot write to {folder} ({error.strerror})") from error
-
-
-@contextlib.contextmanager
-def opened(grid: Grid) -> Iterator[Path]:
-    """The run's folder with its config.json, held against other processes while in use.
-
-    A `UserError` before the first cell is finished leaves what was there before, and nothing else.
-
-    Raises:
-        UserError: as `check_folder`, and if another process holds the folder.
-    """
-    check_folder(grid)
-    folder = grid.folder
-    made = [path for path in (folder, *folder.absolute().parents) if not path.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"--out: cannot write to {folder} ({error.strerror})") from error
-    before = set(folder.iterdir())
-    with _held(folder):
-        try:
-            # Once more: another process may have been here since.
-            check_folder(grid)
-            _clean(folder)
-            _configure(grid)
-            yield folder
-        except UserError:
-            new = set(folder.iterdir()) - before
-            if not (folder / "evaluations.parquet").exists():
-                for path in new:
-                    shutil.rmtree(path) if path.is_dir() else path.unlink()
-                for path in made:
-                    path.rmdir()
-            raise
-
-
-@contextlib.contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    # The operating system gives the lock up when its process ends, however that ends.
-    lock = filelock.FileLock(folder / _LOCK)
-    try:
-        lock.acquire(blocking=False)
-    except filelock.Timeout as error:
-        raise UserError(f"--out: another process is at work in {folder}") from error
-    except OSError as error:
-        raise UserError(f"--out: cannot lock {folder / _LOCK} ({error.strerror})") from error
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-def _clean(folder: Path) -> None:
-    """Remove what a process that was killed while writing left behind."""
-    for pattern in (".*.partial", "*/*.partial", "*/*.orbax-checkpoint-tmp*"):
-        for path in folder.glob(pattern):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
-
-
-def _configure(grid: Grid) -> None:
-    path = grid.folder / "config.json"
-    if not path.exists():
-        config = {"schema": SCHEMA, "config": describe(grid), "versions": versions()}
-        with replacing(path) as partial:
-            partial.write_text(json.dumps(config, indent=2) + "\n")
-
-
-def versions() -> dict[str, str]:
-    """Of the packages that a run's numbers depend on."""
-    return {name: importlib.metadata.version(name) for name in PACKAGES}
-
-
-def other_versions(folder: Path) -> dict[str, str]:
-    """The versions that began the run, of packages which have another one now."""
-    began = json.loads((folder / "config.json").read_text())["versions"]
-    now = versions()
-    return {name: version for name, version in began.items() if now.get(name) != version}
-
-
-def identity(grid: Grid) -> dict[str, Any]:
-    """What a checkpoint must share with a run that goes on from it."""
-    compared = {
-        name: value for name, value in _flat(describe(grid)).items() if name not in _NOT_COMPARED
+    contents = _verified(folder)
+    if "evaluations" not in contents:
+        return {}
+    # Through memory: polars would take brackets in a path for a pattern.
+    tables = {name: pl.read_parquet(io.BytesIO(contents[name])) for name in TABLES}
+    cells = tables["evaluations"].select("method", "n_demos").unique()
+    return {
+        name: table.join(cells, on=["method", "n_demos"], how="semi", maintain_order="left")
+        for name, table in tables.items()
     }
-    digest = hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()
-    return {"config": digest, **versions()}
-
-
-def _compare(path: Path, config: dict[str, Any]) -> None:
-    try:
-        written = json.loads(path.read_text())
-        schema, before = written["schema"], _flat(written["config"])
-        dict(written["versions"])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise UserError(f"--out: {path} is not a readable configuration ({error})") from error
-    if schema != SCHEMA:
-        raise UserError(f"--out: {path} has schema {schema!r}, this version writes {SCHEMA}")
-    now = _flat(config)
-    for name in sorted(before.keys() | now.keys()):
-        if name not in _NOT_COMPARED and before.get(name) != now.get(name):
-            raise UserError(
-                f"--out: {path.parent} holds a run with {_option(name)} {before.get(name)}, not "
-                f"{now.get(name)}; choose another folder or the same configuration"
-            )
-
-
-def read(folder: Path, name: str) -> pl.DataFrame | None:
-    """A table of the run, with its finished cells alone; None before the first cell is finished."""
-    path = folder / f"{name}.parquet"
-    done = folder / "evaluations.parquet"
-    if not done.exists():
-        return None
-    table = pl.read_parquet(path)
-    cells = pl.scan_parquet(done).select("method", "n_demos").unique().collect()
-    return table.join(cells, on=["method", "n_demos"], how="semi", maintain_order="left")
 
 
 def finished(folder: Path) -> set[tuple[str, int]]:
     """`(method, n_demos)` of the finished cells.
 
     Raises:
-        UserError: if a table is damaged.
+        UserError: if a table is not as it was written.
     """
     try:
-        tables = {name: read(folder, name) for name in TABLES}
-        for name, table in tables.items():
-            if table is not None:
-                table.select(COLUMNS[name])
-        evaluations = tables["evaluations"]
-        if evaluations is None:
-            return set()
-        return set(evaluations.select("method", "n_demos").unique().iter_rows())
-    except DAMAGED as error:
-        reason = str(error).splitlines()[0]
-        raise UserError(f"--out: {folder} holds a damaged table ({reason})") from error
+        tables = read(folder)
+    except UserError as error:
+        raise UserError(f"--out: {error}") from error
+    if not tables:
+        return set()
+    return set(tables["evaluations"].select("method", "n_demos").unique().iter_rows())
 
 
 def append(folder: Path, rows: dict[str, pl.DataFrame]) -> None:
     """Add a finished cell's rows to every table."""
+    before, contents = read(folder), {}
     for name in TABLES:
-        before = read(folder, name)
-        table = rows[name] if before is None else pl.concat([before, rows[name]])
+        table = pl.concat([before[name], rows[name]]) if before else rows[name]
         # Through memory: a full disk is an OSError then, not one of polars' own.
         buffer = io.BytesIO()
         table.write_parquet(buffer)
+        contents[name] = buffer.getvalue()
+    digests = {name: [_digest(_content(folder, name)), _digest(contents[name])] for name in TABLES}
+    with replacing(folder / "tables.json") as partial:
+        partial.write_text(json.dumps({"schema": SCHEMA, "sha256": digests}, indent=2) + "\n")
+    for name in TABLES:
         with replacing(folder / f"{name}.parquet") as partial:
-            partial.write_bytes(buffer.getvalue())
+            partial.write_bytes(contents[name])
+
+
+def _verified(folder: Path) -> dict[str, bytes]:
+    """The content of each table that is there."""
+    digests = _digests(folder)
+    while True:
+        contents = {name: _content(folder, name) for name in TABLES}
+        before, digests = digests, _digests(folder)
+        if before == digests:
+            break
+    found = [_digest(content) for content in contents.values()]
+    possible = [digests[name] for name in TABLES]
+    # The first so many of them replaced: any number, but no other choice of them.
+    for replaced in range(len(TABLES) + 1):
+        if found == [pair[at < replaced] for at, pair in enumerate(possible)]:
+            return {name: content for name, content in contents.items() if content is not None}
+    known = list(zip(TABLES, found, possible, strict=True))
+    foreign = [name for name, digest, pair in known if digest not in pair]
+    older = [name for name, digest, pair in known if digest != pair[1]]
+    name = (foreign or older)[0]
+    raise UserError(f"{folder} holds a damaged table ({name}.parquet is not as it was written)")
+
+
+def _digests(folder: Path) -> dict[str, tuple[str | None, str | None]]:
+    """Of each table before and after the last cell was added."""
+    path = folder / "tables.json"
+    try:
+        written = json.loads(path.read_bytes())
+        schema, pairs = written["schema"], written["sha256"]
+        digests = {name: (pairs[name][0], pairs[name][1]) for name in TABLES}
+    except FileNotFoundError:
+        return dict.fromkeys(TABLES, (None, None))
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror})") from error
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise UserError(f"{folder} holds a damaged table (tables.json)") from error
+    if schema != SCHEMA:
+        raise UserError(f"{path} has schema {schema!r}, this version reads {SCHEMA}")
+    return digests
+
+
+def _content(folder: Path, name: str) -> bytes | None:
+    path = folder / f"{name}.parquet"
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror})") from error
+
+
+def _digest(content: bytes | None) -> str | None:
+    return None if content is None else hashlib.sha256(content).hexdigest()
+
+
+def partial(path: Path) -> Path:
+    """Where a file lies until it is whole."""
+    return path.with_name(f".{path.name}.partial")
 
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a path to write to, which then replaces `path` in one move; an error leaves nothing."""
-    partial = path.with_name(f".{path.name}.partial")
+    written = partial(path)
     try:
-        yield partial
+        yield written
         # Or a power cut might leave the name without the content.
-        with partial.open("rb+") as file:
+        with written.open("rb+") as file:
             os.fsync(file.fileno())
-        os.replace(partial, path)
+        os.replace(written, path)
     finally:
-        partial.unlink(missing_ok=True)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return str(value) if isinstance(value, Path) else value
-
-
-def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat = {}
-    for name, value in config.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, "" if name == "settings" else f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value
-    return flat
-
-
-def _option(name: str) -> str:
-    return "--" + name.replace("_", "-")
+        written.unlink(missing_ok=True)

@@ -13,7 +13,7 @@ from polars.testing import assert_frame_equal
 
 from cmedirl_jax import checkpoint, demonstrations
 from cmedirl_jax.methods import METHODS
-from experiments import experts, grid, results, run_grid
+from experiments import experts, grid, results, run_folder, run_grid
 from experiments.errors import UserError
 from tests import pools
 
@@ -214,6 +214,33 @@ def test_a_demonstrations_file_that_cannot_be_used_is_refused(refused, demos, da
     assert refused("--demos", demos, "--n-demos", 1).startswith(f"--demos: {demos}: ")
 
 
+@pytest.mark.parametrize(
+    ("metadata", "named"),
+    [
+        ({"expert": {"name": "human"}}, "expert in its metadata is {'name': 'human'}"),
+        ({"expert": None}, "expert in its metadata is None"),
+        ({"expert_env_steps": "1e5"}, "expert_env_steps in its metadata is '1e5'"),
+        ({"expert_env_steps": True}, "expert_env_steps in its metadata is True"),
+        ({"expert_env_steps": -1}, "expert_env_steps in its metadata is -1"),
+        ({"expert_env_steps": 2**63}, f"expert_env_steps in its metadata is {2**63}"),
+    ],
+)
+def test_metadata_that_no_table_can_hold_is_refused(refused, tmp_path, metadata, named):
+    pool = pools.scripted(5)
+    demonstrations.save(tmp_path / "pool.npz", pool._replace(metadata=pool.metadata | metadata))
+    assert named in refused(*SMOKE, "--demos", "pool.npz", "--out", "run")
+
+
+def test_a_run_that_does_not_fit_in_memory_is_refused(refused, monkeypatch):
+    for error in (MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")):
+
+        def make_pool(*_, error=error):
+            raise error
+
+        monkeypatch.setattr(experts, "make_pool", make_pool)
+        assert "memory is too small" in refused(*SMOKE, "--out", "run")
+
+
 @pytest.mark.parametrize("out", ["file", "file/run"])
 def test_a_folder_that_cannot_be_made_is_refused(refused, tmp_path, out):
     (tmp_path / "file").touch()
@@ -225,7 +252,7 @@ def test_a_folder_that_cannot_be_made_is_refused(refused, tmp_path, out):
 )
 def test_another_configuration_in_the_same_folder_is_refused(refused, option, before, now):
     arguments = (*SMOKE, "--out", "run")
-    with results.opened(run_grid.parse(arguments)):
+    with run_folder.opened(run_grid.parse(arguments)):
         pass
     line = refused(*arguments, option, now)
     assert line.startswith(f"--out: run holds a run with {option} {before}, not {now};")
@@ -278,7 +305,7 @@ def test_a_run_leaves_what_the_design_lists_and_nothing_unfinished(smoke):
     assert {path.name for path in folder.iterdir()} == {
         *("config.json", "summary.csv", "demonstrations", "figures", "policies", "rewards"),
         ".lock",
-        *TABLES,
+        *results.FILES,
     }
     figures = {path.name: path.stat().st_size for path in (folder / "figures").iterdir()}
     assert figures.keys() == {"figure3.png", "figure3.svg"}
@@ -384,10 +411,13 @@ def test_a_finished_run_refuses_another_configuration(smoke, main, capsys):
 
 
 def test_a_run_cut_off_between_cells_resumes_to_the_same_tables(smoke, compiled, tmp_path):
-    folder = shutil.copytree(smoke[0], tmp_path / "run")
-    evaluations = pl.read_parquet(folder / "evaluations.parquet")
-    unfinished = pl.col("method") == "hs-me-ddpg"
-    evaluations.filter(~unfinished).write_parquet(folder / "evaluations.parquet")
+    folder = shutil.copytree(
+        smoke[0], tmp_path / "run", ignore=shutil.ignore_patterns(*results.FILES)
+    )
+    tables = results.read(smoke[0])
+    for method, n_demos in list(CELLS)[:-1]:
+        of_cell = (pl.col("method") == method) & (pl.col("n_demos") == n_demos)
+        results.append(folder, {name: table.filter(of_cell) for name, table in tables.items()})
     (folder / "summary.csv").unlink()
 
     done = run_command(*SMOKE, "--out", folder, **compiled)
