@@ -149,7 +149,8 @@ def _within_memory() -> Iterator[None]:
     try:
         yield
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
-        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+        said = ("RESOURCE_EXHAUSTED", "Out of memory")
+        if isinstance(error, MemoryError) or any(words in str(error) for words in said):
             raise UserError(
                 "the machine's memory is too small for this; give fewer --seeds, --max-steps or "
                 "--evaluation-starts, or smaller networks"
