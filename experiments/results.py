@@ -82,11 +82,12 @@ def _verified(folder: Path) -> dict[str, bytes]:
     """The content of each table that is there."""
     digests = _digests(folder)
     while True:
-        contents = {name: _content(folder, name) for name in TABLES}
+        # The last first: a cell that is added meanwhile replaces them in their order.
+        contents = {name: _content(folder, name) for name in reversed(TABLES)}
         before, digests = digests, _digests(folder)
         if before == digests:
             break
-    found = [_digest(content) for content in contents.values()]
+    found = [_digest(contents[name]) for name in TABLES]
     possible = [digests[name] for name in TABLES]
     # The first so many of them replaced: any number, but no other choice of them.
     for replaced in range(len(TABLES) + 1):
