@@ -404,6 +404,14 @@ def test_a_finished_run_is_left_alone(smoke, main, monkeypatch, capsys):
     assert done.stdout.endswith(capsys.readouterr().out)
 
 
+def test_figures_that_are_gone_are_drawn_again(smoke, main, tmp_path):
+    folder = shutil.copytree(smoke[0], tmp_path / "run")
+    shutil.rmtree(folder / "figures")
+    assert main(*SMOKE, "--out", folder) == 0
+    assert (folder / "figures" / "figure3.png").exists()
+    assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
+
+
 def test_a_finished_run_refuses_another_configuration(smoke, main, capsys):
     before = snapshot(smoke[0])
     assert main(*SMOKE, "--out", smoke[0], "--expert", "median") == 2
