@@ -1,11 +1,20 @@
 """Checks of shapes and dtypes while tracing, which cost nothing when the program runs."""
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.types import EnvSpec, Transition
+from cmedirl_jax.types import EnvSpec, Numeric, Transition
+
+_KINDS = {
+    jnp.floating: "floats",
+    jnp.integer: "integers",
+    jnp.unsignedinteger: "unsigned integers",
+    jnp.bool_: "bool",
+}
 
 
 def transition_shapes(
@@ -60,26 +69,79 @@ def shape(name: str, array: Any, expected: tuple[int, ...]) -> None:
 
 
 def kind(name: str, array: Any, expected: Any) -> None:
-    """Check that a dtype is of a kind: `jnp.floating`, `jnp.integer` or `jnp.bool_`.
+    """Check that a dtype is of a kind: `jnp.floating`, `integer`, `unsignedinteger` or `bool_`.
 
     Raises:
         TypeError: naming the dtype.
     """
     dtype = jnp.result_type(array)
     if not jnp.issubdtype(dtype, expected):
-        words = {jnp.floating: "floats", jnp.integer: "integers", jnp.bool_: "bool"}[expected]
-        raise TypeError(f"{name}: expected {words}, got {dtype}")
+        raise TypeError(f"{name}: expected {_KINDS[expected]}, got {dtype}")
+
+
+def vectors(name: str, array: Any, size: int) -> None:
+    """Check vectors of floats, `[..., size]`, with any leading axes.
+
+    Raises:
+        ValueError: with the shape expected and found.
+        TypeError: if they are not floats.
+    """
+    shape(name, array, (*jnp.shape(array)[:-1], size))
+    kind(name, array, jnp.floating)
 
 
 def sizes(**named: int) -> None:
-    """Check that static sizes are positive.
+    """Check that static sizes are positive integers.
+
+    Raises:
+        ValueError: naming the first that is below 1.
+        TypeError: naming the first that is a float.
+    """
+    _at_least(1, named)
+
+
+def counts(**named: int) -> None:
+    """Check that static counts, of which there may be none, are integers that are not negative.
+
+    Raises:
+        ValueError: naming the first that is below 0.
+        TypeError: naming the first that is a float.
+    """
+    _at_least(0, named)
+
+
+def _at_least(low: int, named: Mapping[str, int]) -> None:
+    for name, size in named.items():
+        if isinstance(size, float | np.floating):
+            raise TypeError(f"{name}: expected an integer, got {size}")
+        if _known(size) and size < low:
+            raise ValueError(f"{name} must be at least {low}, got {size}")
+
+
+def shares(**named: Numeric) -> None:
+    """Check that numbers are between 0 and 1. Arrays pass: their values may not be known.
 
     Raises:
         ValueError: naming the first that is not.
     """
-    for name, size in named.items():
-        if size < 1:
-            raise ValueError(f"{name} must be at least 1, got {size}")
+    for name, share in named.items():
+        if _known(share) and not 0.0 <= share <= 1.0:
+            raise ValueError(f"{name} must be between 0 and 1, got {share}")
+
+
+def positive(**named: Numeric) -> None:
+    """Check that numbers are positive and finite. Arrays pass: their values may not be known.
+
+    Raises:
+        ValueError: naming the first that is not.
+    """
+    for name, number in named.items():
+        if _known(number) and not 0.0 < number < math.inf:
+            raise ValueError(f"{name} must be positive and finite, got {number}")
+
+
+def _known(number: Any) -> bool:
+    return isinstance(number, int | float | np.number)
 
 
 def env_spec(spec: EnvSpec) -> None:
@@ -87,6 +149,7 @@ def env_spec(spec: EnvSpec) -> None:
 
     Raises:
         ValueError: naming the field and what it must be.
+        TypeError: naming a size that is a float.
     """
     sizes(
         **{

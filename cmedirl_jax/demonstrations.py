@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmedirl_jax import checks
 from cmedirl_jax.types import Array, EnvSpec, Numeric, Transition
 
 FORMAT = "cmedirl_jax.demonstrations"
@@ -79,13 +80,18 @@ def subset(
         size: length of the result, of which all but the first `n` are padding. Default `n`.
 
     Raises:
-        ValueError: if the pool holds fewer than `n` (or `size`) episodes, or `n` is not positive.
+        ValueError: if the pool holds fewer than `n` (or `size`) episodes, or `n` is no scalar or
+            not positive.
+        TypeError: if `n` or `size` is not an integer.
     """
+    checks.shape("n", n, ())
+    checks.kind("n", n, jnp.integer)
     if isinstance(pool, Demonstrations):
         pool = episodes(pool)
     size = size if size is not None else int(n)
     if isinstance(n, int | np.integer) and not 1 <= n <= size:
         raise ValueError(f"n must be between 1 and {size}, got {n}")
+    checks.sizes(size=size)
     if size > pool.start.shape[0]:
         raise ValueError(f"{size} demonstrations asked, the pool holds {pool.start.shape[0]}")
     # A permutation's head: the first n are the same whatever the padding.
@@ -95,7 +101,14 @@ def subset(
 
 
 def sample_index(key: jax.Array, subset: DemonstrationSubset, batch_size: int) -> jax.Array:
-    """Steps of the pool, `[batch_size]` int32, uniform over all steps of the subset's episodes."""
+    """Steps of the pool, `[batch_size]` int32, uniform over all steps of the subset's episodes.
+
+    Raises:
+        ValueError: if the subset's fields are not `[n]`, or `batch_size` is negative.
+        TypeError: if the subset or `batch_size` is not of integers.
+    """
+    _check_subset(subset)
+    checks.counts(batch_size=batch_size)
     subset = jax.tree.map(jnp.asarray, subset)
     ends = jnp.cumsum(subset.length)
     step = jax.random.randint(key, (batch_size,), 0, ends[-1])
@@ -117,14 +130,31 @@ def sample(
         pool: the pool; under jit, its transitions, leaves `[N, ...]`.
         subset: which episodes of it.
         batch_size: how many steps.
+
+    Raises:
+        ValueError: if the subset's fields are not `[n]`, or `batch_size` is negative.
+        TypeError: if the subset or `batch_size` is not of integers.
     """
     transition = pool.transition if isinstance(pool, Demonstrations) else pool
     return at(transition, sample_index(key, subset, batch_size))
 
 
 def sample_episodes(key: jax.Array, subset: DemonstrationSubset, count: int) -> jax.Array:
-    """Episodes of the subset, `[count]` int32, uniform with replacement; never its padding."""
+    """Episodes of the subset, `[count]` int32, uniform with replacement; never its padding.
+
+    Raises:
+        ValueError: if the subset's fields are not `[n]`, or `count` is negative.
+        TypeError: if the subset or `count` is not of integers.
+    """
+    _check_subset(subset)
+    checks.counts(count=count)
     return jax.random.randint(key, (count,), 0, jnp.sum(jnp.asarray(subset.length) > 0))
+
+
+def _check_subset(subset: DemonstrationSubset) -> None:
+    for name, leaf in subset._asdict().items():
+        checks.shape(f"subset.{name}", leaf, (jnp.size(subset.start),))
+        checks.kind(f"subset.{name}", leaf, jnp.integer)
 
 
 def at(pool: Transition, index: jax.Array) -> Transition:
@@ -133,7 +163,12 @@ def at(pool: Transition, index: jax.Array) -> Transition:
 
 
 def discounted_returns(demonstrations: Demonstrations, discount: float) -> np.ndarray:
-    """G_t = r_t + discount G_{t+1} within each episode, `[N]` float32 (on the host)."""
+    """G_t = r_t + discount G_{t+1} within each episode, `[N]` float32 (on the host).
+
+    Raises:
+        ValueError: if the discount is not between 0 and 1.
+    """
+    checks.shares(discount=discount)
     reward = np.asarray(demonstrations.transition.reward, np.float64)
     episode = np.asarray(demonstrations.episode)
     result = np.empty_like(reward)

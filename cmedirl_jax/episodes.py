@@ -11,6 +11,8 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import checks
+
 
 class EpisodesState(flax.struct.PyTreeNode):
     """The ring.
@@ -35,11 +37,13 @@ class Episodes(NamedTuple):
     Attributes:
         init: `() -> EpisodesState`, empty.
         step: `(state, step, done) -> EpisodesState`, after transition number `step` `[]` int32 was
-            added to the replay; `done` `[]` bool, that it ended an episode.
+            added to the replay; `done` `[]` bool, that it ended an episode. ValueError for other
+            shapes, TypeError for other dtypes.
         take: `(state, bits [M], steps, recent=None) -> (rows [M, T], mask [M, T])`: M of the ring's
             episodes, uniform with replacement, as rows of the replay's storage, after `steps`
             transitions were added. With `recent`, of those that lie in so many latest transitions.
-            Where there is none, the mask is False throughout.
+            Where there is none, the mask is False throughout. TypeError if the bits are not
+            unsigned integers, ValueError if `recent` is not positive.
     """
 
     init: Callable[[], EpisodesState]
@@ -67,6 +71,9 @@ def make(capacity: int, replay_capacity: int, max_length: int) -> Episodes:
         return EpisodesState(empty, empty, nothing, nothing)
 
     def step(state: EpisodesState, step: jax.Array, done: jax.Array) -> EpisodesState:
+        for name, given, kind in (("step", step, jnp.integer), ("done", done, jnp.bool_)):
+            checks.shape(name, given, ())
+            checks.kind(name, given, kind)
         slot = state.count % capacity
         following = jnp.asarray(step + 1, jnp.int32)
         start = jnp.where(done, state.current, state.start[slot])
@@ -81,6 +88,9 @@ def make(capacity: int, replay_capacity: int, max_length: int) -> Episodes:
     def take(
         state: EpisodesState, bits: jax.Array, steps: jax.Array, recent: int | None = None
     ) -> tuple[jax.Array, jax.Array]:
+        checks.kind("bits", bits, jnp.unsignedinteger)
+        if recent is not None:
+            checks.sizes(recent=recent)
         window = replay_capacity if recent is None else min(recent, replay_capacity)
         whole = (state.length > 0) & (state.start >= steps - window)
         # They are the latest ones, for starts only grow.

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import checks
 from cmedirl_jax.envs import Env
 
 
@@ -54,6 +55,10 @@ def rollout(
         params: its parameters.
         starts: states and observations with a leading axis `B`, as `env.starts` gives them.
         key: for environments that draw in `step`; default one fixed key, the same at every call.
+
+    Raises:
+        ValueError: if the policy's actions are not `[B, A]`.
+        TypeError: if they are not floats.
     """
     states, observations = starts
     count = observations.shape[0]
@@ -62,11 +67,17 @@ def rollout(
     def running(carry) -> jax.Array:
         return ~jnp.all(carry[2])
 
+    def act(observations: jax.Array) -> jax.Array:
+        actions = policy(observations)
+        checks.shape("the policy's actions", actions, (count, env.spec.action_dim))
+        checks.kind("the policy's actions", actions, jnp.floating)
+        return actions
+
     def advance(carry):
         states, observations, done, result, time = carry
         keys = jax.random.split(jax.random.fold_in(key, time), count)
         states, step = jax.vmap(env.step, in_axes=(0, 0, 0, None))(
-            keys, states, policy(observations), params
+            keys, states, act(observations), params
         )
         result = Rollouts(
             episode_return=result.episode_return + jnp.where(done, 0.0, step.reward),
@@ -94,5 +105,11 @@ def summarise(rollouts: Rollouts) -> Evaluation:
 def evaluate(
     policy: Callable[[jax.Array], jax.Array], env: Env, params: Any, starts: int
 ) -> Evaluation:
-    """Evaluate `policy` on `starts` start states, evenly spread and the same at every call."""
+    """Evaluate `policy` on `starts` start states, evenly spread and the same at every call.
+
+    Raises:
+        ValueError: if `starts` is not positive, or the policy's actions are not `[starts, A]`.
+        TypeError: if `starts` is not an integer, or the actions are not floats.
+    """
+    checks.sizes(starts=starts)
     return summarise(rollout(policy, env, params, env.starts(starts, params)))

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmedirl_jax import checks
 from cmedirl_jax.hparams import traced
 from cmedirl_jax.irl import densities
 from cmedirl_jax.types import EnvSpec, Numeric
@@ -29,7 +30,12 @@ class PerturbFn(Protocol):
     def __call__(
         self, state: Any, action: jax.Array, noise: Any, step: Numeric
     ) -> tuple[jax.Array, jax.Array, Any]:
-        """Return `(action [A], log_density [], state)`; `step` counts environment steps."""
+        """Return `(action [A], log_density [], state)`; `step` `[]` counts environment steps.
+
+        Raises:
+            ValueError: if the action, the noise or the step is of another shape.
+            TypeError: if the action or the noise is not of floats.
+        """
         ...
 
 
@@ -41,12 +47,13 @@ class Exploration(NamedTuple):
         reset: `(state) -> state`, at the start of an episode.
         sample: `(key, state, action, step) -> (action, log_density, state)`; `action` `[A]` in is
             mu(s), out is what the behaviour policy does; `log_density` `[]` is its log b(a|s),
-            given the noise's state.
+            given the noise's state. It raises what `perturb` does.
         draw: `(key) -> noise`, the randomness of `sample`, to draw ahead of time.
         perturb: see `PerturbFn`; `sample` is `perturb` of `draw`.
         log_density: `(state, greedy [..., A], action [..., A], step) -> [...]`, the log density of
             the marginal law of the action where mu(s) is `greedy`; of `state` it reads the
-            hyperparameters alone.
+            hyperparameters alone. Leading axes are broadcast. ValueError for another last axis or
+            leading axes that do not go together, TypeError for what is not floats.
     """
 
     init: Callable[[jax.Array], Any]
@@ -117,6 +124,7 @@ def gaussian(spec: EnvSpec, hparams: GaussianHParams | None = None) -> Explorati
         return densities.clipped_normal(spec, greedy, state.scale * _half_width(spec), action)
 
     return _exploration(
+        spec,
         init=lambda key: traced(hparams),
         reset=lambda state: state,
         draw=lambda key: jax.random.normal(key, (spec.action_dim,)),
@@ -157,6 +165,7 @@ def ornstein_uhlenbeck(
         return densities.clipped_normal(spec, greedy, stationary, action)
 
     return _exploration(
+        spec,
         init=init,
         reset=lambda state: state.replace(value=jnp.zeros_like(state.value)),
         draw=lambda key: jax.random.normal(key, (spec.action_dim,)),
@@ -228,6 +237,7 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
         return None if noise is None else noise * _half_width(spec)
 
     return _exploration(
+        spec,
         init=init,
         reset=lambda state: state.replace(remaining=jnp.zeros_like(state.remaining)),
         draw=draw,
@@ -250,13 +260,36 @@ def _clip(spec: EnvSpec, action: jax.Array) -> jax.Array:
 
 
 def _exploration(
+    spec: EnvSpec,
     init: Callable[[jax.Array], Any],
     reset: Callable[[Any], Any],
     draw: Callable[[jax.Array], Any],
     perturb: PerturbFn,
     log_density: Callable[[Any, jax.Array, jax.Array, Numeric], jax.Array],
 ) -> Exploration:
-    def sample(key: jax.Array, state: Any, action: jax.Array, step: Numeric):
-        return perturb(state, action, draw(key), step)
+    """Put the pieces together, and checks of the arrays before them."""
+    drawn = jax.tree.map(jnp.shape, jax.eval_shape(lambda: draw(jax.random.key(0))))
 
-    return Exploration(init, reset, sample, draw, perturb, log_density)
+    def checked_perturb(state: Any, action: jax.Array, noise: Any, step: Numeric):
+        checks.shape("action", action, (spec.action_dim,))
+        checks.kind("action", action, jnp.floating)
+        found = jax.tree.map(jnp.shape, noise)
+        if found != drawn:
+            raise ValueError(f"noise: expected shape {drawn}, got {found}")
+        for leaf in jax.tree.leaves(noise):
+            checks.kind("noise", leaf, jnp.floating)
+        checks.shape("step", step, ())
+        return perturb(state, action, noise, step)
+
+    def checked_log_density(
+        state: Any, greedy: jax.Array, action: jax.Array, step: Numeric
+    ) -> jax.Array:
+        checks.vectors("greedy", greedy, spec.action_dim)
+        checks.vectors("action", action, spec.action_dim)
+        jnp.broadcast_shapes(jnp.shape(greedy), jnp.shape(action))
+        return log_density(state, greedy, action, step)
+
+    def sample(key: jax.Array, state: Any, action: jax.Array, step: Numeric):
+        return checked_perturb(state, action, draw(key), step)
+
+    return Exploration(init, reset, sample, draw, checked_perturb, checked_log_density)

@@ -73,7 +73,11 @@ def data(
 
     The returns are of the environment's reward and end with the demonstration, also where the time
     limit cut it off.
+
+    Raises:
+        ValueError: if the discount is not between 0 and 1, or the scale not positive and finite.
     """
+    checks.positive(reward_scale=reward_scale)
     returns = demonstrations_lib.discounted_returns(demonstrations, discount)
     return HotStartData(
         demonstrations.transition,

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmedirl_jax import checks
 from cmedirl_jax.types import EnvSpec, Network, Params
 
 Normalisation = Literal["none", "layer", "batch"]
@@ -174,6 +175,8 @@ def squashing(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
 def observation_scaling(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
     """The affine map from `spec`'s observation bounds to [-1, 1]: `[..., O]` -> `[..., O]`.
 
+    It raises ValueError for another last axis, and TypeError for what is not floats.
+
     Raises:
         ValueError: if a bound is infinite.
     """
@@ -184,7 +187,12 @@ def observation_scaling(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
         )
     centre = 0.5 * (spec.observation_high + spec.observation_low)
     half_width = 0.5 * (spec.observation_high - spec.observation_low)
-    return lambda observation: (observation - centre) / half_width
+
+    def scale(observation: jax.Array) -> jax.Array:
+        checks.vectors("observation", observation, spec.observation_dim)
+        return (observation - centre) / half_width
+
+    return scale
 
 
 def from_module(apply: Callable[..., Any], init: Callable[[jax.Array], Params]) -> Network:

@@ -35,9 +35,11 @@ class Replay(NamedTuple):
             leaves `[O]`, `[A]` and `[]`, else ValueError, or TypeError for other dtypes.
         sample: `(key, state, batch_size, recent=None) -> Transition`, leaves `[batch_size, ...]`:
             uniform with replacement over what is there, or over its `recent` latest transitions.
-            An empty buffer gives zeros.
+            An empty buffer gives zeros. ValueError if `batch_size` is negative, or `recent` not
+            positive.
         draw: `(key, batch_size) -> bits`, the randomness of `sample`, to draw ahead of time.
-        take: `(state, bits, recent=None) -> Transition`; `sample` is `take` of `draw`.
+        take: `(state, bits, recent=None) -> Transition`; `sample` is `take` of `draw`. TypeError if
+            the bits are not unsigned integers.
         rows: `(state, bits, recent=None) -> index`, the rows of the storage that `take` reads.
         at: `(state, index [...]) -> Transition`, leaves `[..., ...]`, what lies in these rows.
     """
@@ -70,9 +72,13 @@ def make(spec: EnvSpec, capacity: int) -> Replay:
         return ReplayState(state.storage.at[position].set(row), state.count + 1)
 
     def draw(key: jax.Array, batch_size: int) -> jax.Array:
+        checks.counts(batch_size=batch_size)
         return jax.random.bits(key, (batch_size,), jnp.uint32)
 
     def rows(state: ReplayState, bits: jax.Array, recent: int | None = None) -> jax.Array:
+        checks.kind("bits", bits, jnp.unsignedinteger)
+        if recent is not None:
+            checks.sizes(recent=recent)
         size = jnp.minimum(state.count, capacity if recent is None else min(recent, capacity))
         # The bias of a remainder is below size / 2^32: nothing beside sampling noise.
         age = (bits % jnp.maximum(size, 1).astype(jnp.uint32)).astype(jnp.int32)
@@ -118,7 +124,13 @@ def pack(spec: EnvSpec, transition: Transition) -> jax.Array:
 
 
 def unpack(spec: EnvSpec, rows: jax.Array) -> Transition:
-    """The transition in rows `[..., D]`: the inverse of `pack`."""
+    """The transition in rows `[..., D]`: the inverse of `pack`.
+
+    Raises:
+        ValueError: if the rows are not of `row_size` floats.
+        TypeError: if they are not floats.
+    """
+    checks.vectors("rows", rows, row_size(spec))
     o, a = spec.observation_dim, spec.action_dim
     return Transition(
         observation=rows[..., :o],

@@ -2,8 +2,8 @@
 
     network = rewards.linear(spec, rewards.fourier(spec, order=3))
 
-All take an observation `[..., O]` and an action `[..., A]`; those of the inputs "state" ignore the
-action.
+All take an observation `[..., O]` and an action `[..., A]`, floats with the same leading axes, else
+ValueError, or TypeError for other dtypes; those of the inputs "state" ignore the action.
 """
 
 from collections.abc import Callable
@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import lattice, networks
-from cmedirl_jax.types import Array, EnvSpec, Network
+from cmedirl_jax import checks, lattice, networks
+from cmedirl_jax.types import Array, EnvSpec, Network, Params
 
 Inputs = Literal["state-action", "state"]
 """Whether a reward is r(s, a) or r(s)."""
@@ -36,11 +36,21 @@ def mlp(
     """
     architecture = networks.Architecture(hidden=hidden, critic_normalisation="none")
     if inputs == "state-action":
-        return networks.critic(spec, architecture)
+        network = networks.critic(spec, architecture)
+
+        def apply(params: Params, observation: Array, action: Array) -> jax.Array:
+            checks.pairs(spec, observation, action)
+            return network.apply(params, observation, action)
+
+        return network._replace(apply=apply)
     of_state = networks.scalar_output(networks.actor(spec._replace(action_dim=1), architecture))
-    return of_state._replace(
-        apply=lambda params, observation, action: of_state.apply(params, observation)
-    )
+
+    def apply_to_state(params: Params, observation: Array, action: Array) -> jax.Array:
+        del action
+        checks.pairs(spec, observation)
+        return of_state.apply(params, observation)
+
+    return of_state._replace(apply=apply_to_state)
 
 
 def linear(spec: EnvSpec, features: Features) -> Network:
@@ -74,6 +84,7 @@ def radial_basis(spec: EnvSpec, centres: int, inputs: Inputs = "state-action") -
     width = axis[1] - axis[0]
 
     def features(observation: Array, action: Array) -> jax.Array:
+        checks.pairs(spec, observation, None if inputs == "state" else action)
         away = (scale(jnp.asarray(observation))[..., None, :] - grid) / width
         local = jax.nn.softmax(-0.5 * jnp.sum(jnp.square(away), axis=-1), axis=-1)
         if inputs == "state":
@@ -106,6 +117,7 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
     frequencies = np.pi * lattice.product(*[np.arange(order + 1.0)] * len(low))
 
     def features(observation: Array, action: Array) -> jax.Array:
+        checks.pairs(spec, observation, None if inputs == "state" else action)
         if inputs == "state-action":
             observation = jnp.concatenate([observation, action], axis=-1)
         x = (observation - low) / (high - low)

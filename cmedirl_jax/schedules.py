@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import checks
 from cmedirl_jax.shaping import Shaping
 
 
@@ -96,13 +97,27 @@ class Plan(NamedTuple):
 
 
 def plan(step: jax.Array, schedule: Schedule, reward_schedule: RewardSchedule) -> Plan:
-    """What environment step `step` (`[]` int32) does."""
+    """What environment step `step` (`[]` int32) does.
+
+    Raises:
+        ValueError: if `step` is no scalar, or a period or the length of a fall not positive.
+        TypeError: if one of them is not an integer.
+    """
+    checks.shape("step", step, ())
+    checks.kind("step", step, jnp.integer)
+    checks.sizes(
+        period=reward_schedule.period,
+        update_period=schedule.update_period,
+        target_period=schedule.target_period,
+        behaviour_cloning_steps=schedule.behaviour_cloning_steps,
+    )
     learns = step >= schedule.learning_starts
     learn_reward = learns & (step % reward_schedule.period == 0)
     if reward_schedule.stop is not None:
         learn_reward &= step < reward_schedule.stop
     reward_weight = jnp.ones_like(step, jnp.float32)
     if reward_schedule.anneal_steps is not None:
+        checks.sizes(anneal_steps=reward_schedule.anneal_steps)
         reward_weight = _falling(step, reward_schedule.anneal_steps)
     return Plan(
         step=step,

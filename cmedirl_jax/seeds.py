@@ -12,6 +12,8 @@ import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 
+from cmedirl_jax import checks
+
 State = TypeVar("State")
 
 GROUP_SIZES = ((range(4, 11), 128), (range(2, 3), 256))
@@ -19,7 +21,13 @@ GROUP_SIZES = ((range(4, 11), 128), (range(2, 3), 256))
 
 
 def keys(key: jax.Array, count: int) -> jax.Array:
-    """`[count]` keys; seed i's is `fold_in(key, i)`, whatever the count."""
+    """`[count]` keys; seed i's is `fold_in(key, i)`, whatever the count.
+
+    Raises:
+        ValueError: if the count is negative.
+        TypeError: if it is not an integer.
+    """
+    checks.counts(count=count)
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, np.arange(count))
 
 
@@ -30,7 +38,12 @@ def group_size(seeds: int, devices: int = 1, hidden: Sequence[int] = (64, 64)) -
         seeds: how many seeds there are.
         devices: how many devices share them.
         hidden: units of each hidden layer.
+
+    Raises:
+        ValueError: if `seeds` or `devices` is not positive.
+        TypeError: if one of them is not an integer.
     """
+    checks.sizes(seeds=seeds, devices=devices)
     per_device = -(-seeds // devices)
     for sizes, width in GROUP_SIZES:
         if max(hidden, default=0) < width:
@@ -41,7 +54,14 @@ def group_size(seeds: int, devices: int = 1, hidden: Sequence[int] = (64, 64)) -
 
 
 def padded(seeds: int, group: int, devices: int = 1) -> int:
-    """The least number of seeds, at least `seeds`, that fills whole groups on every device."""
+    """The least number of seeds, at least `seeds`, that fills whole groups on every device.
+
+    Raises:
+        ValueError: if `seeds` is negative, or `group` or `devices` not positive.
+        TypeError: if one of them is not an integer.
+    """
+    checks.counts(seeds=seeds)
+    checks.sizes(group=group, devices=devices)
     block = group * devices
     return -(-seeds // block) * block
 
@@ -52,7 +72,13 @@ def map_groups(function: Callable[..., State], group: int) -> Callable[..., Stat
     Args:
         function: takes and returns one seed's pytree; further arguments are shared by all seeds.
         group: seeds per `vmap`; must divide the number of seeds.
+
+    Raises:
+        ValueError: if `group` is not positive; and, when called, if it does not divide the number
+            of seeds, or the leaves have not that number in their leading axis.
+        TypeError: if `group` is not an integer.
     """
+    checks.sizes(group=group)
 
     def mapped(states, *shared):
         count = _whole_groups(states, group)
@@ -79,7 +105,12 @@ def step_groups(
     Returns:
         `(states, groups [] int32, *shared) -> (states, outputs)`. The seeds past the first `groups`
         groups keep their states, and their outputs are zeros.
+
+    Raises:
+        ValueError: as `map_groups`.
+        TypeError: if `group` is not an integer.
     """
+    checks.sizes(group=group)
 
     def mapped(states, groups, *shared):
         count = _whole_groups(states, group)
@@ -114,7 +145,10 @@ def step_groups(
 
 
 def _whole_groups(states: Any, group: int) -> int:
-    count = jax.tree.leaves(states)[0].shape[0]
+    leading = sorted({jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(states)})
+    if len(leading) != 1 or leading == [()]:
+        raise ValueError(f"expected leaves with one leading axis of seeds, got {leading}")
+    (count,) = leading[0]
     if count % group:
         raise ValueError(f"{count} seeds are not whole groups of {group}")
     return count

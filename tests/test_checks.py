@@ -3,8 +3,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmedirl_jax import checks, composition, ddpg, hot_start, irl, replay, tabular
+from cmedirl_jax import (
+    checks,
+    composition,
+    ddpg,
+    demonstrations,
+    episodes,
+    exploration,
+    hot_start,
+    irl,
+    replay,
+    rewards,
+    schedules,
+    shaping,
+    tabular,
+)
 from cmedirl_jax.demonstrations import DemonstrationSubset
+from cmedirl_jax.exploration import EpsilonGreedyHParams
 from cmedirl_jax.methods import METHODS, Settings
 from cmedirl_jax.types import RewardBatch, Transition
 
@@ -73,6 +88,10 @@ def test_observations_without_bounds_agree_with_themselves(skewed_spec):
 
 
 STATES, ACTIONS, HORIZON, SUCCESSORS = 4, 3, 5, 2
+
+
+def abstract(function):
+    return lambda **arrays: jax.eval_shape(lambda: function(**arrays))
 
 
 def public_functions(spec):
@@ -162,6 +181,78 @@ def public_functions(spec):
     return calls
 
 
+def component_functions(spec):
+    batch, key = transition(spec, 6)._asdict(), jax.random.key(0)
+    seen = {name: batch[name] for name in ("observation", "action")}
+    one, step = jnp.ones(()), jnp.zeros((), jnp.int32)
+    shaped = dict.fromkeys(("environment_reward", "before", "after"), batch["reward"])
+    ring = episodes.make(3, 10, 5)
+    subset = {"start": jnp.zeros(2, jnp.int32), "length": jnp.ones(2, jnp.int32)}
+
+    def sample(**subset):
+        pool = transition(spec, 6)
+        return demonstrations.sample(key, pool, DemonstrationSubset(**subset), 4)
+
+    def plan(step):
+        return schedules.plan(step, schedules.Schedule(), schedules.RewardSchedule())
+
+    calls = {
+        "additive": (
+            shaping.additive,
+            dict.fromkeys(("environment_reward", "learned_reward"), batch["reward"])
+            | {"weight": one},
+        ),
+        "potential": (
+            shaping.potential,
+            shaped | {"terminated": batch["terminated"], "weight": one, "discount": one},
+        ),
+        "replay.unpack": (
+            lambda rows: replay.unpack(spec, rows),
+            {"rows": jnp.zeros((6, replay.row_size(spec)))},
+        ),
+        "demonstrations.sample": (sample, subset),
+        "episodes.step": (
+            lambda **arrays: ring.step(ring.init(), **arrays),
+            {"step": step, "done": jnp.zeros((), bool)},
+        ),
+        "plan": (plan, {"step": step}),
+        "radial_basis": (rewards.radial_basis(spec, 2), seen),
+        "fourier": (rewards.fourier(spec, 1), seen),
+    }
+    network = rewards.mlp(spec)
+    params = network.init(key)
+    calls["mlp"] = lambda **arrays: network.apply(params, **arrays), seen
+    behaviours = {
+        "gaussian": exploration.gaussian(spec),
+        "ornstein_uhlenbeck": exploration.ornstein_uhlenbeck(spec),
+        "epsilon_greedy": exploration.epsilon_greedy(spec),
+        "noisy_epsilon_greedy": exploration.epsilon_greedy(spec, EpsilonGreedyHParams(noise=0.3)),
+    }
+    for name, behaviour in behaviours.items():
+        noise, tree = jax.tree.flatten(behaviour.draw(key))
+        state = behaviour.init(key)
+
+        def perturb(action, number, behaviour=behaviour, state=state, tree=tree, **noise):
+            noise = jax.tree.unflatten(tree, noise.values())
+            return behaviour.perturb(state, action, noise, number)
+
+        def sampled(action, number, behaviour=behaviour, state=state):
+            return behaviour.sample(key, state, action, number)
+
+        def log_density(greedy, action, behaviour=behaviour, state=state):
+            return behaviour.log_density(state, greedy, action, 0)
+
+        given = {"action": batch["action"][0], "number": one}
+        drawn = {f"noise_{index}": leaf for index, leaf in enumerate(noise)}
+        calls[f"{name}.perturb"] = perturb, given | drawn
+        calls[f"{name}.sample"] = sampled, given
+        calls[f"{name}.log_density"] = (
+            log_density,
+            {"greedy": batch["action"], "action": batch["action"]},
+        )
+    return calls
+
+
 def tabular_functions():
     dense = {"dynamics": jnp.full((STATES, ACTIONS, STATES), 1 / STATES)}
     sparse = {
@@ -170,9 +261,6 @@ def tabular_functions():
     }
     of_states = {"absorbing": jnp.zeros(STATES, bool), "guess": jnp.zeros(STATES)}
     reward = {"reward": jnp.zeros((STATES, ACTIONS))}
-
-    def abstract(function):
-        return lambda **arrays: jax.eval_shape(lambda: function(**arrays))
 
     def sparsely(next_state, probability, **arrays):
         dynamics = tabular.SparseDynamics(next_state, probability)
@@ -214,6 +302,17 @@ def tabular_functions():
     }
 
 
+ANY_NUMBERS = (
+    *("log_density", "discounted_return", "log_probabilities"),
+    *("weight", "discount", "number"),
+)
+"""What may be integers as well as floats."""
+
+
+def takes_any_leading_axes(function):
+    return function in ("act", "replay.unpack") or function.endswith(".log_density")
+
+
 def wrong_arrays(name, array):
     """Arrays that are not `array`'s shape, or not its kind."""
     if array.ndim:
@@ -221,18 +320,22 @@ def wrong_arrays(name, array):
         yield jnp.concatenate([array, array[:1]])
     yield array[None]
     yield array[..., None]
-    if name not in ("log_density", "length", "discounted_return", "log_probabilities"):
+    if name not in ANY_NUMBERS:
         yield array.astype(jnp.float32 if not jnp.issubdtype(array.dtype, jnp.floating) else int)
 
 
 def test_public_functions_take_right_arrays_and_refuse_every_other_by_shape_or_dtype(skewed_spec):
     refusals = 0
-    for function, (call, right) in (public_functions(skewed_spec) | tabular_functions()).items():
+    functions = public_functions(skewed_spec)
+    for name, (call, right) in component_functions(skewed_spec).items():
+        functions[name] = abstract(call), right
+    for function, (call, right) in (functions | tabular_functions()).items():
         call(**right)
         for name, array in right.items():
             for wrong in wrong_arrays(name, array):
-                if function == "act" and wrong.shape[-1:] == (3,) and wrong.dtype == array.dtype:
-                    continue  # Any leading axes are right.
+                same = (wrong.shape[-1:], wrong.dtype) == (array.shape[-1:], array.dtype)
+                if same and takes_any_leading_axes(function):
+                    continue
                 said = f"{function}({name}={wrong.dtype}{wrong.shape}): "
                 try:
                     call(**right | {name: wrong})
@@ -267,3 +370,46 @@ def test_a_hot_start_of_no_size_is_refused(skewed_spec, size):
 def test_a_horizon_of_no_step_is_refused(solve):
     with pytest.raises(ValueError, match="horizon must be at least 1, got 0"):
         solve(np.full((2, 2, 2), 0.5), np.zeros((2, 2)), discount=1.0, horizon=0)
+
+
+@pytest.mark.parametrize("check", [checks.sizes, checks.counts])
+def test_sizes_are_whole_numbers(check):
+    check(size=1, other=np.int64(3))
+    with pytest.raises(TypeError, match=r"size: expected an integer, got 2\.5"):
+        check(size=2.5)
+    with pytest.raises(ValueError, match=r"size must be at least \d, got -1"):
+        check(size=np.int64(-1))
+
+
+@pytest.mark.parametrize("wrong", [-0.1, 1.1, float("nan"), np.float32(2.0)])
+def test_shares_are_between_0_and_1(wrong):
+    checks.shares(share=0, other=1.0)
+    with pytest.raises(ValueError, match=r"share must be between 0 and 1, got"):
+        checks.shares(share=wrong)
+
+
+@pytest.mark.parametrize("wrong", [0, -1.0, float("nan"), float("inf")])
+def test_positive_numbers_are_finite(wrong):
+    checks.positive(scale=1, other=1e-3)
+    with pytest.raises(ValueError, match=r"scale must be positive and finite, got"):
+        checks.positive(scale=wrong)
+
+
+def test_values_that_are_traced_are_not_asked_for():
+    def check(number):
+        checks.sizes(number=number)
+        checks.shares(number=number)
+        checks.positive(number=number)
+        return number
+
+    assert jax.jit(check)(-5) == -5
+
+
+def test_checked_functions_do_not_compile_again_for_other_values(skewed_spec):
+    functions = component_functions(skewed_spec)
+    for name in ("additive", "potential", "replay.unpack", "fourier", "gaussian.sample"):
+        call, right = functions[name]
+        compiled = jax.jit(lambda arrays, call=call: call(**arrays))
+        compiled(right)
+        compiled({name: jnp.zeros_like(leaf) for name, leaf in right.items()})
+        assert compiled._cache_size() == 1, name

@@ -457,6 +457,17 @@ def test_impossible_subsets_are_refused(n, size, message):
         demonstrations.subset(KEY, EPISODES, n, size)
 
 
+@pytest.mark.parametrize(("n", "size"), [(2.5, None), (2.5, 3), (np.float32(2), 3), (2, 2.5)])
+def test_numbers_of_demonstrations_are_whole(n, size):
+    with pytest.raises(TypeError, match=r"expected .*integer"):
+        demonstrations.subset(KEY, EPISODES, n, size)
+
+
+def test_one_number_of_demonstrations_is_drawn_at_a_time():
+    with pytest.raises(ValueError, match=r"n: expected shape \(\), got \(3,\)"):
+        demonstrations.subset(KEY, EPISODES, np.array([1, 2, 3]), 3)
+
+
 # Steps 4..7 and 10..15 of the pool of eight, with padding between and after.
 SUBSET = DemonstrationSubset(np.array([4, 8, 10, 0]), np.array([4, 0, 6, 0]))
 
@@ -466,6 +477,29 @@ def test_sampling_is_uniform_over_the_steps_of_a_subset():
     steps, counts = np.unique(index, return_counts=True)
     np.testing.assert_array_equal(steps, [4, 5, 6, 7, 10, 11, 12, 13, 14, 15])
     assert scipy.stats.chisquare(counts).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"length": np.array([4])}, ValueError, r"length: expected shape \(4,\), got \(1,\)"),
+        ({"start": np.array(4)}, ValueError, r"start: expected shape \(1,\), got \(\)"),
+        ({"start": np.zeros(4)}, TypeError, "start: expected integers, got float32"),
+    ],
+)
+def test_subsets_that_contradict_themselves_are_refused(change, error, message):
+    subset = SUBSET._replace(**change)
+    with pytest.raises(error, match=rf"subset\.{message}"):
+        demonstrations.sample_index(KEY, subset, 3)
+    with pytest.raises(error, match=rf"subset\.{message}"):
+        demonstrations.sample_episodes(KEY, subset, 3)
+
+
+def test_samples_of_a_negative_number_are_refused():
+    with pytest.raises(ValueError, match="batch_size must be at least 0, got -1"):
+        demonstrations.sample_index(KEY, SUBSET, -1)
+    with pytest.raises(ValueError, match="count must be at least 0, got -1"):
+        demonstrations.sample_episodes(KEY, SUBSET, -1)
 
 
 def test_a_sample_is_whole_transitions_of_the_pool():
@@ -495,3 +529,9 @@ def test_returns_equal_brute_force(lengths, discount):
     actual = demonstrations.discounted_returns(pool, discount)
     assert actual.dtype == np.float32
     np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("discount", [-0.1, 2.0, float("nan")])
+def test_discounts_of_returns_are_between_0_and_1(discount):
+    with pytest.raises(ValueError, match=f"discount must be between 0 and 1, got {discount}"):
+        demonstrations.discounted_returns(make_pool([3]), discount)

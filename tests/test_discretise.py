@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmedirl_jax import evaluation, tabular
+from cmedirl_jax import checks, evaluation, tabular
 from cmedirl_jax.tabular import discretise
 from cmedirl_jax.tabular.interpolation import points
 from tests.compiling import jit_as_users
@@ -122,6 +122,8 @@ def test_soft_policies_are_run_by_drawing(env, mdp):
     always_right = jnp.where(jnp.arange(5) == 4, 0.0, -jnp.inf) + uniform
     params = env.default_params
     drawing = discretise.sampled(mdp, env)
+    checks.env_spec(drawing.spec)
+    assert drawing.spec.action_dim == 5
 
     def returns(preference):
         return evaluation.rollout(

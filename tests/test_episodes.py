@@ -117,3 +117,24 @@ def test_vmapped_rings_do_not_mix():
 def test_sizes_must_be_positive(sizes):
     with pytest.raises(ValueError, match="must be positive"):
         episodes.make(*sizes)
+
+
+@pytest.mark.parametrize("dtype", [jnp.int32, jnp.float32])
+def test_bits_are_unsigned(dtype):
+    ring, _ = jitted(3, 7)
+    with pytest.raises(TypeError, match="bits: expected unsigned integers, got "):
+        ring.take(ring.init(), jnp.zeros(3, dtype), 0)
+
+
+def test_a_window_of_nothing_is_refused():
+    ring, _ = jitted(3, 7)
+    with pytest.raises(ValueError, match="recent must be at least 1, got 0"):
+        ring.take(ring.init(), BITS[:3], 0, 0)
+
+
+def test_one_step_of_one_ring_is_recorded():
+    ring, _ = jitted(3, 7)
+    with pytest.raises(ValueError, match=r"done: expected shape \(\), got \(2,\)"):
+        ring.step(ring.init(), 0, np.array([True, False]))
+    with pytest.raises(TypeError, match="done: expected bool, got float32"):
+        ring.step(ring.init(), 0, np.float32(1.0))

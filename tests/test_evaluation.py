@@ -102,3 +102,22 @@ def test_every_step_of_every_start_draws_from_a_key_of_its_own(spec):
     assert len(set(np.asarray(returns()).tolist())) == 4
     assert returns().all()
     assert (returns() != returns(jax.random.key(1))).all()
+
+
+@pytest.mark.parametrize(
+    ("policy", "error", "message"),
+    [
+        (lambda o: o[:, 0], ValueError, r"actions: expected shape \(3, 1\), got \(3,\)"),
+        (lambda o: o, ValueError, r"actions: expected shape \(3, 1\), got \(3, 2\)"),
+        (lambda o: o[:1, :1], ValueError, r"actions: expected shape \(3, 1\), got \(1, 1\)"),
+        (lambda o: jnp.ones((3, 1), int), TypeError, "actions: expected floats, got int32"),
+    ],
+)
+def test_other_actions_of_a_policy_are_refused(env, params, policy, error, message):
+    with pytest.raises(error, match=message):
+        evaluation.evaluate(policy, env, params, 3)
+
+
+def test_an_evaluation_needs_a_start(env, params):
+    with pytest.raises(ValueError, match="starts must be at least 1, got 0"):
+        evaluation.evaluate(bang_bang, env, params, 0)

@@ -381,3 +381,32 @@ def test_actions_weighted_by_their_densities_estimate_the_partition_function(nam
         error = estimates.std() / len(estimates) ** 0.5
         assert error < 0.02 * value
         assert abs(estimates.mean() - value) < 4 * error
+
+
+@kinds
+def test_other_arrays_than_one_step_of_the_spec_are_refused(kind):
+    behaviour = BEHAVIOURS[kind]
+    state = behaviour.init(KEY)
+    for action in (jnp.zeros((5, 1)), jnp.zeros(2), jnp.zeros(())):
+        with pytest.raises(ValueError, match=r"action: expected shape \(1,\), got"):
+            behaviour.sample(KEY, state, action, 0)
+    with pytest.raises(TypeError, match="action: expected floats, got int32"):
+        behaviour.sample(KEY, state, jnp.zeros(1, int), 0)
+    with pytest.raises(ValueError, match="noise: expected shape"):
+        behaviour.perturb(state, jnp.zeros(1), jnp.zeros((5, 1)), 0)
+    with pytest.raises(ValueError, match=r"step: expected shape \(\), got \(5,\)"):
+        behaviour.sample(KEY, state, jnp.zeros(1), jnp.arange(5))
+
+
+@kinds
+def test_marginal_densities_read_the_last_axis_and_broadcast_the_leading_ones(kind):
+    behaviour = BEHAVIOURS[kind]
+    state = behaviour.init(KEY)
+    found = behaviour.log_density(state, jnp.zeros((4, 1, 1)), jnp.ones((5, 1)), 0)
+    assert found.shape == (4, 5)
+    with pytest.raises(ValueError, match=r"greedy: expected shape \(1,\), got \(5,\)"):
+        behaviour.log_density(state, jnp.zeros(5), jnp.zeros(5), 0)
+    with pytest.raises(ValueError, match=r"\(5, 1\), \(7, 1\)"):
+        behaviour.log_density(state, jnp.zeros((5, 1)), jnp.zeros((7, 1)), 0)
+    with pytest.raises(TypeError, match="action: expected floats, got int32"):
+        behaviour.log_density(state, jnp.zeros((5, 1)), jnp.zeros((5, 1), int), 0)

@@ -158,3 +158,17 @@ def test_a_pool_can_be_passed_as_it_is():
     direct = hot_start.fit(jax.random.key(2), SMALL, params, pool, hparams)
     prepared = hot_start.fit(jax.random.key(2), SMALL, params, hot_start.data(pool, 0.99), hparams)
     chex.assert_trees_all_equal(direct, prepared)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"discount": 2.0}, "discount must be between 0 and 1, got 2.0"),
+        ({"discount": float("nan")}, "discount must be between 0 and 1, got nan"),
+        ({"reward_scale": -1.0}, "reward_scale must be positive and finite, got -1.0"),
+        ({"reward_scale": float("inf")}, "reward_scale must be positive and finite, got inf"),
+    ],
+)
+def test_data_for_no_agent_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        hot_start.data(pools.scripted(2), **given)

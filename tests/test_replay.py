@@ -145,6 +145,30 @@ def test_leaves_of_another_size_are_refused(leaf):
         replay.pack(SPEC, wrong)
 
 
+@pytest.mark.parametrize("width", [4, 9])
+def test_rows_of_another_width_are_refused(width):
+    with pytest.raises(ValueError, match=rf"rows: expected shape \(5, 7\), got \(5, {width}\)"):
+        replay.unpack(SPEC, jnp.zeros((5, width)))
+
+
+def test_impossible_samples_are_refused():
+    buffer = replay.make(SPEC, 3)
+    state = buffer.init()
+    with pytest.raises(ValueError, match="batch_size must be at least 0, got -1"):
+        buffer.sample(KEY, state, -1)
+    for recent in (0, -5):
+        with pytest.raises(ValueError, match=f"recent must be at least 1, got {recent}"):
+            buffer.sample(KEY, state, 3, recent)
+    for bits in (jnp.zeros(3), jnp.zeros(3, jnp.int32)):
+        with pytest.raises(TypeError, match=f"bits: expected unsigned integers, got {bits.dtype}"):
+            buffer.take(state, bits)
+
+
+def test_a_batch_of_nothing_is_empty():
+    buffer = replay.make(SPEC, 3)
+    assert buffer.sample(KEY, buffer.init(), 0).observation.shape == (0, 2)
+
+
 def test_other_values_do_not_recompile():
     buffer = jitted(3)
     add = jax.jit(replay.make(SPEC, 3).add)

@@ -107,3 +107,26 @@ def test_features_need_resolution_and_finite_bounds(spec):
     rewards.fourier(strong, 3, "state")
     with pytest.raises(ValueError, match="finite bounds"):
         rewards.fourier(strong, 3)
+
+
+@pytest.mark.parametrize("inputs", ["state-action", "state"])
+@pytest.mark.parametrize("make", [rewards.radial_basis, rewards.fourier])
+def test_features_refuse_other_sizes_and_leading_axes(skewed_spec, make, inputs):
+    features = make(skewed_spec, 2, inputs)
+    observation, action = pairs(skewed_spec)
+    wrong = [(observation[:, :1], action), (observation.astype(int), action)]
+    if inputs == "state-action":
+        wrong += [(observation, action[0]), (observation[:4], action), (observation[:, :2], action)]
+    for given in wrong:
+        with pytest.raises((ValueError, TypeError), match="expected"):
+            features(*given)
+    if inputs == "state":
+        assert features(observation, None).shape[0] == 5
+
+
+@pytest.mark.parametrize("inputs", ["state-action", "state"])
+def test_mlp_does_not_broadcast_an_observation(skewed_spec, inputs):
+    network = rewards.mlp(skewed_spec, hidden=(8,), inputs=inputs)
+    observation, action = pairs(skewed_spec)
+    with pytest.raises(ValueError, match=r"expected the same leading axes .*\(5, 1\)"):
+        network.apply(network.init(jax.random.key(0)), observation[:, :1], action)

@@ -44,3 +44,24 @@ def test_weights_fall_linearly_to_zero_and_stay_there():
 def test_cloning_that_does_not_fade(cloning, weight):
     found = plans(Schedule(cloning=cloning, behaviour_cloning_steps=50))
     np.testing.assert_array_equal(found.cloning_weight, np.full(60, weight))
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ({"schedule": Schedule(update_period=0)}, "update_period"),
+        ({"schedule": Schedule(target_period=0)}, "target_period"),
+        ({"schedule": Schedule(behaviour_cloning_steps=0)}, "behaviour_cloning_steps"),
+        ({"reward": RewardSchedule(period=0)}, "period"),
+        ({"reward": RewardSchedule(anneal_steps=0)}, "anneal_steps"),
+    ],
+)
+def test_periods_are_positive(given, name):
+    with pytest.raises(ValueError, match=f"^{name} must be at least 1, got 0"):
+        plans(**given)
+
+
+def test_steps_are_counted_one_at_a_time():
+    for step, error in ((jnp.arange(3), ValueError), (jnp.zeros(()), TypeError)):
+        with pytest.raises(error, match="step: expected"):
+            schedules.plan(step, Schedule(), RewardSchedule())

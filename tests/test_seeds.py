@@ -134,3 +134,32 @@ def test_stepping_over_devices_steps_the_first_groups_of_each():
     np.testing.assert_allclose(stepped["position"][moved], expected["position"][moved], rtol=1e-6)
     np.testing.assert_array_equal(stepped["position"][~moved], 1.0)
     assert outputs["norm"].sharding.is_equivalent_to(seeds.sharding(devices), 1)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: seeds.keys(KEY, -1), "count must be at least 0, got -1"),
+        (lambda: seeds.group_size(0), "seeds must be at least 1, got 0"),
+        (lambda: seeds.group_size(3, 0), "devices must be at least 1, got 0"),
+        (lambda: seeds.padded(-1, 2), "seeds must be at least 0, got -1"),
+        (lambda: seeds.padded(3, 0), "group must be at least 1, got 0"),
+        (lambda: seeds.padded(3, 1, 0), "devices must be at least 1, got 0"),
+        (lambda: seeds.map_groups(walk, 0), "group must be at least 1, got 0"),
+        (lambda: seeds.step_groups(stroll, 0), "group must be at least 1, got 0"),
+    ],
+)
+def test_numbers_of_seeds_that_there_are_not_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+@pytest.mark.parametrize("position", [jnp.ones((6, 2, 3)), jnp.ones(())])
+def test_leaves_of_other_numbers_of_seeds_are_refused(position):
+    wrong = states(12) | {"position": position}
+    for mapped in (
+        lambda: seeds.map_groups(walk, 2)(wrong, *SHARED),
+        lambda: seeds.step_groups(stroll, 2)(wrong, 1, *SHARED),
+    ):
+        with pytest.raises(ValueError, match="expected leaves with one leading axis of seeds, got"):
+            mapped()

@@ -35,9 +35,10 @@ def optimal_q(dynamics, reward, absorbing, discount=0.9):
 
 def shaped(reward, potential, terminated, weight=1.0):
     with jax.enable_x64(True):
-        found = shaping.potential(
-            reward[:, :, None], potential[:, None, None], potential, terminated, 0.9, weight
+        arrays = np.broadcast_arrays(
+            reward[:, :, None], potential[:, None, None], potential, terminated
         )
+        found = shaping.potential(*arrays, 0.9, weight)
         return np.asarray(found)
 
 
@@ -67,3 +68,12 @@ def test_a_truncation_keeps_its_potential():
     before, after = np.float32([0.5, 0.5]), np.float32([2.0, 2.0])
     found = shaping.potential(R_E[:2], before, after, np.array([False, True]), 0.9, 2.0)
     np.testing.assert_allclose(found, [-0.1 + 2 * (1.8 - 0.5), 100.0 - 1.0], rtol=1e-6)
+
+
+def test_rewards_of_other_shapes_do_not_broadcast():
+    with pytest.raises(ValueError, match=r"learned_reward: expected shape \(3,\), got \(3, 1\)"):
+        shaping.additive(R_E, R_D[:, None])
+    with pytest.raises(ValueError, match=r"after: expected shape \(3,\), got \(3, 1\)"):
+        shaping.potential(R_E, R_D, R_D[:, None], np.zeros(3, bool), 0.9)
+    with pytest.raises(TypeError, match="terminated: expected bool, got float32"):
+        shaping.potential(R_E, R_D, R_D, np.zeros(3, np.float32), 0.9)

@@ -133,7 +133,8 @@ def sampled(mdp: FiniteMDP, env: Env) -> Env:
     """`env` with log-probabilities over the grid's actions for actions, drawn by the step's key.
 
     It makes a stochastic policy out of one that only reads observations, so that
-    `evaluation.rollout` can run it: `lambda o: look_up(mdp, policy.log_probabilities, o)`.
+    `evaluation.rollout` can run it: `lambda o: look_up(mdp, policy.log_probabilities, o)`. Its
+    specification has so many actions as the grid; a log-probability may also be -inf.
     """
     actions = jnp.asarray(interpolation.points(mdp.actions))
 
@@ -142,7 +143,13 @@ def sampled(mdp: FiniteMDP, env: Env) -> Env:
         drawn = actions[jax.random.categorical(draw_key, action)]
         return env.step(step_key, state, drawn, params)
 
-    return env._replace(step=step)
+    size = len(actions)
+    spec = env.spec._replace(
+        action_dim=size,
+        action_low=np.full(size, np.finfo(np.float32).min),
+        action_high=np.zeros(size, np.float32),
+    )
+    return env._replace(spec=spec, step=step)
 
 
 def grids(
