@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 import jax
 
+from experiments import output
 from experiments.errors import UserError
 from experiments.presets import Grid
 
@@ -66,10 +67,10 @@ def supervise(arguments: Sequence[str]) -> int:
         signal.signal(number, lambda number, _: child.send_signal(number))
     code = child.wait()
     if code == -signal.SIGABRT:
-        print(GONE, file=sys.stderr)
+        output.complain(GONE)
         return 1
     if code < 0:
-        print(f"run_grid: ended by {signal.Signals(-code).name}", file=sys.stderr)
+        output.complain(f"run_grid: ended by {signal.Signals(-code).name}")
         return 128 - code
     return code
 
@@ -113,17 +114,17 @@ def guarded(run: Callable[[], int]) -> int:
         # What all agree on they may leave in peace: 2, or a signal's code.
         if code != 1:
             return code
-        sys.stdout.flush()
+        output.flush()
         os._exit(code)
     except Exception as error:
         # An ordinary exit would wait for the processes that wait for this one.
         lost = any(transport in str(error) for transport in ("Gloo", "NCCL", "oordination"))
         # A value that never came is a ValueError to whoever looks at it.
         if isinstance(error, jax.errors.JaxRuntimeError | ValueError) and lost:
-            print(GONE, file=sys.stderr, flush=True)
+            output.complain(GONE)
         else:
-            traceback.print_exc()
-        sys.stdout.flush()
+            output.complain(traceback.format_exc().rstrip())
+        output.flush()
         os._exit(1)
 
 
