@@ -1,7 +1,9 @@
 """The life of a run's processes: they meet, are watched, and end together; docs/scaling.md."""
 
+import errno
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -84,9 +86,13 @@ def join(grid: Grid) -> None:
     """Meet the other processes; before any other use of JAX.
 
     Raises:
-        UserError: if JAX's cluster detection finds no cluster.
+        UserError: if JAX's cluster detection finds no cluster, or process 0 cannot listen.
     """
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    # Else it listens where that says, and not on the coordinator's port.
+    if grid.process_id == 0 and "JAX_COORDINATOR_BIND_ADDRESS" not in os.environ:
+        assert grid.coordinator is not None
+        _check_port(int(grid.coordinator.rpartition(":")[2]))
     # At once, unless noted: an exception would leave the others waiting.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     # It would take SIGTERM for itself.
@@ -105,6 +111,28 @@ def join(grid: Grid) -> None:
             f"--distributed: JAX detects no cluster here ({error}); "
             "give --coordinator HOST:PORT --processes N --process-id I"
         ) from error
+
+
+def _check_port(port: int) -> None:
+    """See that the coordinator can listen on a port, of which JAX would say no more than SIGSEGV.
+
+    Raises:
+        UserError: if it cannot.
+    """
+    # As JAX does: all addresses, by IPv6 where there is such a thing.
+    address = ("::", port) if socket.has_dualstack_ipv6() else ("", port)
+    family = socket.AF_INET6 if socket.has_dualstack_ipv6() else socket.AF_INET
+    try:
+        with socket.socket(family) as listener:
+            # The connections of a run that has just ended are in nobody's way.
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if family == socket.AF_INET6:
+                listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+            listener.bind(address)
+    except OSError as error:
+        used = error.errno == errno.EADDRINUSE
+        reason = "is in use" if used else f"cannot be listened on ({error.strerror})"
+        raise UserError(f"--coordinator: port {port} {reason}") from error
 
 
 def guarded(run: Callable[[], int]) -> int:
