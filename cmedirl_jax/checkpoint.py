@@ -1,13 +1,18 @@
 """Pytrees on disk, by orbax. The only file of the library that imports it."""
 
+import contextlib
 import errno
 import os
+import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 from orbax.checkpoint import v1 as orbax
+
+from cmedirl_jax import disk
 
 _OVERHEAD = 2**20
 """Bytes that a checkpoint may take beside its arrays."""
@@ -27,6 +32,7 @@ def save(path: str | Path, tree: Any) -> None:
     Raises:
         FileExistsError: if there is something at `path` that is not a checkpoint, to be replaced.
         OSError: if the folder cannot be written, or its disk has no room for the arrays.
+        ValueError: if the tree is not such a one.
     """
     path = os.path.abspath(path)
     if os.path.exists(path) and not _is_checkpoint(path):
@@ -37,12 +43,11 @@ def save(path: str | Path, tree: Any) -> None:
     needed = sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) + _OVERHEAD
     if shutil.disk_usage(parent).free < needed:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
-    try:
+    with _os_errors(path):
         orbax.save(path, tree, overwrite=True)
-    except ValueError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path) from error
+    if jax.process_index() == 0:
+        disk.flush(Path(path))
+        disk.flush_name(Path(path))
 
 
 def load(path: str | Path, like: Any = None) -> Any:
@@ -56,13 +61,19 @@ def load(path: str | Path, like: Any = None) -> Any:
 
     Raises:
         FileNotFoundError: if there is no checkpoint at `path`.
+        OSError: if it cannot be read.
         ValueError: if its structure differs from `like`'s.
     """
     path = os.path.abspath(path)
     if not _is_checkpoint(path):
         raise FileNotFoundError(f"{path}: no checkpoint there")
-    if like is None:
-        return orbax.load(path)
+    with _os_errors(path):
+        if like is None:
+            return orbax.load(path)
+        return _load(path, like)
+
+
+def _load(path: str, like: Any) -> Any:
     # Orbax passes over a None that stands where the other tree has an array.
     held = len(jax.tree.leaves(orbax.metadata(path).metadata))
     if held != len(jax.tree.leaves(like)):
@@ -75,6 +86,19 @@ def load(path: str | Path, like: Any = None) -> Any:
         return orbax.load(path, abstract)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: holds another structure ({error})") from error
+
+
+@contextlib.contextmanager
+def _os_errors(path: str) -> Iterator[None]:
+    """Make OSErrors of those that tensorstore wraps into ValueErrors."""
+    try:
+        yield
+    except ValueError as error:
+        number = re.search(r"os_error_code='(\d+)'", str(error))
+        if number is None and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        code = errno.ENOSPC if number is None else int(number[1])
+        raise OSError(code, os.strerror(code), path) from error
 
 
 def _is_checkpoint(path: str) -> bool:

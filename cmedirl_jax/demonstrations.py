@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, disk
 from cmedirl_jax.types import Array, EnvSpec, Numeric, Transition
 
 FORMAT = "cmedirl_jax.demonstrations"
@@ -247,7 +247,7 @@ def save(path: str | Path, demonstrations: Demonstrations) -> None:
                 episode=np.asarray(demonstrations.episode),
                 **{name: np.asarray(x) for name, x in demonstrations.transition._asdict().items()},
             )
-        partial.replace(path)
+        disk.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
 

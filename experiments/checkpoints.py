@@ -6,7 +6,8 @@ A checkpoint is a folder, `checkpoints/CELL/STEP`, that appears in one move when
     record.npz      the host's arrays
     manifest.json   what wrote it, and the digest of every file
 
-A checkpoint whose files are not those of its manifest is never read further.
+A checkpoint whose files are not those of its manifest is never read further, and removed. One
+that the system fails to read may be whole: it is kept.
 """
 
 import concurrent.futures
@@ -22,14 +23,16 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from cmedirl_jax import checkpoint
+from cmedirl_jax import checkpoint, disk
 from experiments import clerk, distributed
 from experiments.errors import UserError
 from experiments.interruption import Interruption
 
-SCHEMA = 1
+SCHEMA = 2
 KEPT = 2
 _PARTIAL = ".partial"
+_DAMAGED = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
+"""What the system says of files that are not as they were written; else it could not read them."""
 
 
 class Snapshot(NamedTuple):
@@ -91,7 +94,8 @@ class Keeper:
             like: the abstract state (as `jax.eval_shape` gives it) that belongs to a record.
 
         Raises:
-            UserError: if one has another schema or identity; it is left as it is.
+            UserError: if one has another schema or identity, or the system does not let it be read;
+                it is left as it is.
         """
         held: list[Snapshot] = []
 
@@ -114,12 +118,21 @@ class Keeper:
         return Snapshot(step, state, record)
 
     def _newest(self, like: Callable[[dict[str, np.ndarray]], Any]) -> Snapshot | None:
-        for path in _newest_first(self.folder):
-            try:
-                return _read(path, self.identity, like)
-            except _Unusable as reason:
+        try:
+            for path in _newest_first(self.folder):
+                try:
+                    return _read(path, self.identity, like)
+                except _Unusable as error:
+                    reason = str(error)
+                except _DAMAGED as error:
+                    reason = f"is damaged ({Path(error.filename or path).name})"
                 self._say(f"{path} {reason}: going back to the one before, if there is one")
                 shutil.rmtree(path)
+        except OSError as error:
+            raise UserError(
+                f"--out: cannot use {error.filename or self.folder} "
+                f"({error.strerror or error}); the checkpoints are kept"
+            ) from error
         return None
 
     def visit(self, step: int, take: Callable[[], tuple[Any, dict[str, np.ndarray]]]) -> None:
@@ -167,7 +180,13 @@ class _Unusable(Exception):
 def _newest_first(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
-    steps = [path for path in folder.iterdir() if path.name.isdecimal()]
+    with os.scandir(folder) as entries:
+        # Whatever else is called like a step is not ours.
+        steps = [
+            folder / entry.name
+            for entry in entries
+            if entry.name.isdecimal() and entry.is_dir(follow_symlinks=False)
+        ]
     return sorted(steps, key=lambda path: int(path.name), reverse=True)
 
 
@@ -179,11 +198,15 @@ def _write(folder: Path, identity: dict[str, Any], snapshot: Snapshot) -> None:
         clerk.call(checkpoint.save, partial / "state", snapshot.state)
         with (partial / "record.npz").open("wb") as file:
             np.savez(file, allow_pickle=False, **snapshot.record)
-            os.fsync(file.fileno())
-        manifest = {"schema": SCHEMA, "identity": identity, "files": _digests(partial)}
+        manifest = {
+            "schema": SCHEMA,
+            "step": snapshot.step,
+            "identity": identity,
+            "files": _digests(partial),
+        }
         sealed = {**manifest, "sha256": _digest_of(manifest)}
         (partial / "manifest.json").write_text(json.dumps(sealed, indent=2) + "\n")
-        os.replace(partial, folder / str(snapshot.step))
+        disk.replace(partial, folder / str(snapshot.step))
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     for old in _newest_first(folder)[KEPT:]:
@@ -197,8 +220,8 @@ def _read(
         manifest = json.loads((path / "manifest.json").read_bytes())
         digest = manifest.pop("sha256")
         intact = digest == _digest_of(manifest)
-        schema, written, files = (manifest[name] for name in ("schema", "identity", "files"))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        schema = manifest["schema"]
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise _Unusable("is damaged (manifest.json)") from error
     if not intact:
         raise _Unusable("is damaged (manifest.json)")
@@ -207,10 +230,10 @@ def _read(
             f"--out: {path} has schema {schema!r}, this version reads {SCHEMA}; go on with the "
             "version that wrote it, or remove it"
         )
-    try:
-        found = _digests(path)
-    except OSError as error:
-        raise _Unusable(f"cannot be read ({error.strerror})") from error
+    step, written, files = (manifest[name] for name in ("step", "identity", "files"))
+    if step != int(path.name):
+        raise _Unusable(f"is damaged (it is of step {step})")
+    found = _digests(path)
     for name in sorted(files.keys() | found.keys()):
         if files.get(name) != found.get(name):
             raise _Unusable(f"is damaged ({name})")
@@ -226,13 +249,19 @@ def _read(
         state = clerk.call(checkpoint.load, path / "state", like(record))
     except ValueError as error:
         raise _Unusable("holds another structure") from error
-    return Snapshot(int(path.name), jax.tree.map(np.asarray, state), record)
+    return Snapshot(step, jax.tree.map(np.asarray, state), record)
 
 
 def _digests(folder: Path) -> dict[str, str]:
     """The digest of every file below `folder` but the manifest."""
+
+    def refuse(error: OSError) -> None:
+        raise error
+
     digests = {}
-    for path in sorted(folder.rglob("*")):
+    # `rglob` passes over folders that cannot be read.
+    walk = os.walk(folder, onerror=refuse)
+    for path in sorted(Path(parent, name) for parent, _, names in walk for name in names):
         if path.is_file() and path.name != "manifest.json":
             with path.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()

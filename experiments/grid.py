@@ -135,8 +135,12 @@ def run(
                 f"{cost.misses} did not",
                 highlight=False,
             )
+        if interruption.came():
+            interruption.stop()
         if not distributed.is_writer():
             return None
+        # What follows is done again at the next start if a signal ends it.
+        interruption.release()
         shutil.rmtree(grid.folder / "checkpoints", ignore_errors=True)
         # Matplotlib and scipy take a second to import, which a refusal need not wait for.
         from experiments import conclusion

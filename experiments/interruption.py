@@ -3,8 +3,9 @@
 import contextlib
 import os
 import signal
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import NoReturn
 
@@ -30,8 +31,9 @@ class Interrupted(Exception):
 class Interruption:
     """Which signal has asked this process to stop, if any."""
 
-    def __init__(self):
+    def __init__(self, restore: Callable[[], None] = lambda: None):
         self.signal: int | None = None
+        self._restore = restore
 
     def came(self) -> bool:
         """Whether a signal has asked any process of the run to stop: a collective of them all."""
@@ -45,6 +47,16 @@ class Interruption:
         """
         raise Interrupted(signal.SIGTERM if self.signal is None else self.signal)
 
+    def release(self) -> None:
+        """Let signals act at once from here on, where there is nothing left to save.
+
+        Raises:
+            Interrupted: if one came before.
+        """
+        self._restore()
+        if self.signal is not None:
+            self.stop()
+
 
 @contextlib.contextmanager
 def noted(notice: str | None = None) -> Iterator[Interruption]:
@@ -53,7 +65,7 @@ def noted(notice: str | None = None) -> Iterator[Interruption]:
     Args:
         notice: written to standard output at the first.
     """
-    interruption, first = Interruption(), 0.0
+    first = 0.0
     before = {number: signal.getsignal(number) for number in SIGNALS}
 
     def restore() -> None:
@@ -65,12 +77,17 @@ def noted(notice: str | None = None) -> Iterator[Interruption]:
         if interruption.signal is None:
             interruption.signal, first = number, time.monotonic()
             if notice is not None:
-                # `print` may be what the signal interrupts.
-                os.write(1, notice.encode())
+                # `print` may be what the signal interrupts; the reader may have ended by it.
+                with contextlib.suppress(OSError):
+                    os.write(1, notice.encode())
         elif time.monotonic() - first >= TWICE:
             restore()
             signal.raise_signal(number)
 
+    # Descriptor 1 is another file's where the run was started without standard output.
+    if sys.__stdout__ is None:
+        notice = None
+    interruption = Interruption(restore)
     for number in SIGNALS:
         signal.signal(number, note)
     try:

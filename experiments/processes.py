@@ -1,7 +1,9 @@
 """The life of a run's processes: they meet, are watched, and end together; docs/scaling.md."""
 
+import errno
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -10,6 +12,7 @@ from collections.abc import Callable, Sequence
 
 import jax
 
+from experiments import output
 from experiments.errors import UserError
 from experiments.presets import Grid
 
@@ -66,10 +69,10 @@ def supervise(arguments: Sequence[str]) -> int:
         signal.signal(number, lambda number, _: child.send_signal(number))
     code = child.wait()
     if code == -signal.SIGABRT:
-        print(GONE, file=sys.stderr)
+        output.complain(GONE)
         return 1
     if code < 0:
-        print(f"run_grid: ended by {signal.Signals(-code).name}", file=sys.stderr)
+        output.complain(f"run_grid: ended by {signal.Signals(-code).name}")
         return 128 - code
     return code
 
@@ -83,9 +86,13 @@ def join(grid: Grid) -> None:
     """Meet the other processes; before any other use of JAX.
 
     Raises:
-        UserError: if JAX's cluster detection finds no cluster.
+        UserError: if JAX's cluster detection finds no cluster, or process 0 cannot listen.
     """
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    # Else it listens where that says, and not on the coordinator's port.
+    if grid.process_id == 0 and "JAX_COORDINATOR_BIND_ADDRESS" not in os.environ:
+        assert grid.coordinator is not None
+        _check_port(int(grid.coordinator.rpartition(":")[2]))
     # At once, unless noted: an exception would leave the others waiting.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     # It would take SIGTERM for itself.
@@ -106,6 +113,28 @@ def join(grid: Grid) -> None:
         ) from error
 
 
+def _check_port(port: int) -> None:
+    """See that the coordinator can listen on a port, of which JAX would say no more than SIGSEGV.
+
+    Raises:
+        UserError: if it cannot.
+    """
+    # As JAX does: all addresses, by IPv6 where there is such a thing.
+    address = ("::", port) if socket.has_dualstack_ipv6() else ("", port)
+    family = socket.AF_INET6 if socket.has_dualstack_ipv6() else socket.AF_INET
+    try:
+        with socket.socket(family) as listener:
+            # The connections of a run that has just ended are in nobody's way.
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if family == socket.AF_INET6:
+                listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+            listener.bind(address)
+    except OSError as error:
+        used = error.errno == errno.EADDRINUSE
+        reason = "is in use" if used else f"cannot be listened on ({error.strerror})"
+        raise UserError(f"--coordinator: port {port} {reason}") from error
+
+
 def guarded(run: Callable[[], int]) -> int:
     """Run a worker's share; where it fails alone end at once, so that the others learn of it."""
     try:
@@ -113,17 +142,17 @@ def guarded(run: Callable[[], int]) -> int:
         # What all agree on they may leave in peace: 2, or a signal's code.
         if code != 1:
             return code
-        sys.stdout.flush()
+        output.flush()
         os._exit(code)
     except Exception as error:
         # An ordinary exit would wait for the processes that wait for this one.
         lost = any(transport in str(error) for transport in ("Gloo", "NCCL", "oordination"))
         # A value that never came is a ValueError to whoever looks at it.
         if isinstance(error, jax.errors.JaxRuntimeError | ValueError) and lost:
-            print(GONE, file=sys.stderr, flush=True)
+            output.complain(GONE)
         else:
-            traceback.print_exc()
-        sys.stdout.flush()
+            output.complain(traceback.format_exc().rstrip())
+        output.flush()
         os._exit(1)
 
 

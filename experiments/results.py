@@ -9,12 +9,12 @@ import contextlib
 import hashlib
 import io
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import polars as pl
 
+from cmedirl_jax import disk
 from experiments.errors import UserError
 
 SCHEMA = 1
@@ -143,9 +143,6 @@ def replacing(path: Path) -> Iterator[Path]:
     written = partial(path)
     try:
         yield written
-        # Or a power cut might leave the name without the content.
-        with written.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(written, path)
+        disk.replace(written, path)
     finally:
         written.unlink(missing_ok=True)

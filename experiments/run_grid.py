@@ -14,7 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from experiments import compilation, distributed, heap, interruption, processes
+from experiments import compilation, distributed, heap, interruption, output, processes
 from experiments import grid as grid_lib
 from experiments.errors import UserError
 from experiments.interruption import Interrupted
@@ -26,7 +26,13 @@ _CONTINUE = "start the same command again to go on"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        return _main(sys.argv[1:] if arguments is None else arguments)
+    finally:
+        output.flush()
+
+
+def _main(arguments: Sequence[str]) -> int:
     grid = parse(arguments)
     try:
         processes.check(grid)
@@ -41,9 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def work(grid: Grid) -> int:
     """Do the run, or this process's share of it; returns the exit code."""
-    console = Console()
+    console = Console(file=output.dispensable())
     if not console.is_terminal:
-        console = Console(width=120)
+        console = Console(file=output.dispensable(), width=120)
     heap.share(arenas=cores())
     compilation.use_cache()
     try:
@@ -74,7 +80,7 @@ def work(grid: Grid) -> int:
 
 
 def _end(exit_code: int, line: str) -> int:
-    print(f"run_grid: {line}", file=sys.stderr)
+    output.complain(f"run_grid: {line}")
     return exit_code
 
 

@@ -1,6 +1,12 @@
+import errno
+import gc
+import hashlib
 import json
+import os
+import resource
 import shutil
 import time
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -229,16 +235,80 @@ def test_another_structure_begins_anew_and_says_so(kept):
     assert "holds another structure" in kept.lines[0]
 
 
-def test_another_schema_is_refused_and_kept(kept):
+@pytest.mark.parametrize("schema", [1, 3])
+def test_another_schema_is_refused_and_kept(kept, schema):
     kept.save(250)
     path = kept.folder / "250" / "manifest.json"
     manifest = json.loads(path.read_text())
-    del manifest["sha256"]
-    manifest["schema"] = 2
+    # The first schema had no step.
+    del manifest["sha256"], manifest["step"]
+    manifest["schema"] = schema
     path.write_text(json.dumps({**manifest, "sha256": checkpoints._digest_of(manifest)}))
-    with pytest.raises(UserError, match="has schema 2, this version reads 1"):
+    with pytest.raises(UserError, match=f"has schema {schema}, this version reads 2"):
         kept.keeper().load(like)
     assert kept.names() == ["250"]
+
+
+def test_a_checkpoint_that_was_renamed_is_not_of_its_step(kept):
+    kept.save(250, 500)
+    (kept.folder / "500").rename(kept.folder / "1500")
+    assert_is(kept.keeper().load(like), 250)
+    assert kept.lines[0].startswith(f"{kept.folder / '1500'} is damaged (it is of step 500)")
+
+
+UNREADABLE = {
+    "folder": (os, "scandir"),
+    "manifest": (Path, "read_bytes"),
+    "folder of the state": (os, "walk"),
+    "files": (hashlib, "file_digest"),
+    "record": (np, "load"),
+    "state": (checkpoint, "load"),
+}
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.EACCES, errno.EMFILE, errno.ESTALE])
+@pytest.mark.parametrize("what", UNREADABLE)
+def test_a_checkpoint_that_cannot_be_read_for_now_is_refused_and_kept(
+    kept, monkeypatch, what, number
+):
+    kept.save(250, 500)
+
+    def fail(*_, **__):
+        raise OSError(number, os.strerror(number), "the file")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(*UNREADABLE[what], fail)
+        with pytest.raises(UserError) as refused:
+            kept.keeper().load(like)
+    line = f"--out: cannot use the file ({os.strerror(number)}); the checkpoints are kept"
+    assert str(refused.value) == line
+    assert kept.names() == ["250", "500"]
+    assert_is(kept.keeper().load(like), 500)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="nothing is closed to this user")
+def test_a_folder_that_is_closed_to_the_user_is_not_damaged(kept):
+    kept.save(250)
+    state = kept.folder / "250" / "state"
+    state.chmod(0)
+    try:
+        with pytest.raises(UserError, match="Permission denied"):
+            kept.keeper().load(like)
+    finally:
+        state.chmod(0o700)
+    assert kept.names() == ["250"]
+
+
+def test_what_is_called_like_a_step_and_is_no_folder_is_left_alone(kept):
+    kept.save(250, 500)
+    (kept.folder / "99999").touch()
+    (kept.folder / "88888").symlink_to(kept.folder / "250")
+    assert_is(kept.keeper().load(like), 500)
+    kept.save(750, 88888, 99999)
+    assert kept.names() == ["500", "750", "88888", "99999"]
+    assert_is(kept.keeper().load(like), 750)
+    reports = [line for line in kept.lines if line.startswith("no checkpoint could be saved")]
+    assert len(reports) == 2
 
 
 def test_a_full_disk_is_reported_and_training_goes_on(kept, monkeypatch):
@@ -255,3 +325,31 @@ def test_a_full_disk_is_reported_and_training_goes_on(kept, monkeypatch):
     keeper.visit(750, lambda: (state_at(750), record_at(750)))
     keeper.wait()
     assert kept.names() == ["250", "750"]
+
+
+# Orbax abandons its other writes, and the collector complains of them.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_write_that_fails_under_orbaxs_hands_is_reported_and_training_goes_on(kept):
+    kept.save(250)
+    large = {"weights": np.random.default_rng(0).random(2**18)}
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    keeper = kept.keeper()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, before[1]))
+    try:
+        keeper.visit(500, lambda: (large, {}))
+        keeper.wait()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        gc.collect()
+    assert kept.lines == [f"no checkpoint could be saved in {kept.folder} (File too large)"]
+    assert kept.names() == ["250"]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("state", [{"weights": object()}, {"weights": np.zeros(0)}])
+def test_what_can_never_be_saved_is_an_error(kept, state):
+    keeper = kept.keeper()
+    keeper.visit(250, lambda: (state, {}))
+    with pytest.raises((AttributeError, ValueError)):
+        keeper.wait()
+    gc.collect()

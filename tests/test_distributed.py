@@ -76,6 +76,29 @@ def test_what_the_writer_refuses_is_raised():
         distributed.from_writer(refuse)
 
 
+def test_a_port_is_free_again_at_once_when_a_run_has_ended():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        with socket.create_connection(("127.0.0.1", port)):
+            connection, _ = listener.accept()
+            # Whoever closes first keeps the port for a while, in TIME_WAIT.
+            connection.close()
+    processes._check_port(port)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_a_port_that_is_taken_is_refused(compiled, tmp_path, host):
+    with socket.create_server((host, 0)) as listener:
+        port = listener.getsockname()[1]
+        options = (
+            *("--coordinator", f"127.0.0.1:{port}", "--processes", PROCESSES, "--process-id", 0),
+            *("--devices", 1, "--out", tmp_path / "run"),
+        )
+        with Processes(tmp_path, lambda _: compiled, lambda _: options, count=1) as run:
+            assert run.codes(60) == [2]
+            assert run.output(0) == f"run_grid: --coordinator: port {port} is in use\n"
+
+
 def free_port():
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
@@ -241,6 +264,23 @@ def test_processes_that_a_cluster_starts_find_each_other_and_refuse_together(com
                 f"run_grid: --process-id: not all processes were given the same options ({differ})"
             )
     assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_refused_on_all(compiled, tmp_path):
+    port = free_port()
+    (tmp_path / "file").touch()
+
+    def options(index):
+        return (
+            *("--coordinator", f"127.0.0.1:{port}", "--processes", PROCESSES),
+            *("--process-id", index, "--devices", 1, "--seeds", 9, "--out", tmp_path / "file/run"),
+        )
+
+    with Processes(tmp_path, lambda _: compiled, options) as run:
+        assert run.codes(60) == [2, 2]
+        for index in range(PROCESSES):
+            line = run.output(index).splitlines()[-1]
+            assert line.startswith("run_grid: --out: cannot write to ")
 
 
 def test_without_a_cluster_there_is_nothing_to_join(tmp_path):

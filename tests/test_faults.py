@@ -11,13 +11,18 @@ import sys
 import time
 from pathlib import Path
 
+import chex
+import jax
 import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from cmedirl_jax import demonstrations
-from experiments import results
+from cmedirl_jax import checkpoint, demonstrations
+from experiments import conclusion, results, run_grid
 from tests import pools
+
+# Orbax says so on every load that names no shardings.
+pytestmark = pytest.mark.filterwarnings("ignore:Sharding info not provided:UserWarning")
 
 ROOT = Path(__file__).parents[1]
 STEPS = 1500
@@ -29,6 +34,7 @@ RUN = (
 """Two cells of the same program, six chunks each, every one of which is saved."""
 CONTINUE = "start the same command again to go on\n"
 ISOLATED = ("unshare", "--map-root-user", "--mount")
+LEARNED = ("policies", "rewards")
 LIMIT = 300.0
 """Seconds after which a process that should have ended is one that hangs."""
 
@@ -90,6 +96,11 @@ def assert_same_run(folder, whole):
     assert {path for path in left if "d" not in path.parts} == {
         path for path in expected if "d" not in path.parts
     }
+    learned = [path.relative_to(whole) for name in LEARNED for path in (whole / name).iterdir()]
+    assert learned
+    for path in learned:
+        found, wanted = checkpoint.load(folder / path), checkpoint.load(whole / path)
+        chex.assert_trees_all_equal(found, wanted, strict=True)
 
 
 def paths(run, pattern):
@@ -152,6 +163,8 @@ PHASES = {
     "drawing": ("figures/*", 0.2),
 }
 """What is written when a phase begins, and seconds that it takes."""
+ATTEMPTS = 20
+"""Processes within which four must be met in the phase."""
 
 
 @pytest.mark.slow
@@ -161,19 +174,26 @@ def test_a_run_may_be_killed_in_any_phase(runs, whole, tmp_path, phase):
     run, kills = tmp_path / "run", 0
     pattern, seconds = PHASES[phase]
     moments = random.Random(phase)
-    while kills < 4:
+    for _ in range(ATTEMPTS):
         fresh = {}
         if phase == "compiling":
             # It is written once, and this phase is in every process that finds no program.
             (run / "config.json").unlink(missing_ok=True)
+            if (run / "evaluations.parquet").exists():
+                shutil.rmtree(run)
             fresh["JAX_COMPILATION_CACHE_DIR"] = str(tmp_path / f"empty-{kills}")
         began = time.time()
         process = runs.start(run, **fresh)
         wait_for(process, lambda began=began: written_since(began, run, pattern))
         time.sleep(moments.uniform(0.0, seconds))
         kills += kill(process)
+        # It may have been too late.
+        assert process.returncode in (0, -signal.SIGKILL)
         if (run / "summary.csv").exists():
             shutil.rmtree(run)
+        if kills == 4:
+            break
+    assert kills == 4
     runs.finish(run)
     assert_same_run(run, whole)
 
@@ -202,6 +222,54 @@ def test_a_signal_ends_a_run_with_its_code_and_a_line(runs, whole, tmp_path):
         assert process.returncode == 128 + number
     assert "goes on from its checkpoint" in runs.finish(run)
     assert_same_run(run, whole)
+
+
+def test_a_run_needs_no_reader(runs, whole, tmp_path):
+    """As `| tee log` where a signal ends `tee` too, and then `> /dev/full`."""
+    run = tmp_path / "run"
+    reader, writer = os.pipe()
+    process = subprocess.Popen(
+        runs.command(run), cwd=ROOT, env=runs.environment, stdout=writer, stderr=writer
+    )
+    os.close(writer)
+    os.read(reader, 1)
+    os.close(reader)
+    wait_for(process, lambda: progress(run) >= 500)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(LIMIT) == 130
+    assert 500 <= progress(run) < 2 * STEPS
+    with open("/dev/full", "w") as full:
+        process = subprocess.run(
+            runs.command(run), cwd=ROOT, env=runs.environment, stdout=full, stderr=full, check=False
+        )
+    assert process.returncode == 0
+    assert_same_run(run, whole)
+
+
+@pytest.fixture
+def again(runs, whole, tmp_path, monkeypatch):
+    """The command within this process, on a run that is finished."""
+    folder = shutil.copytree(whole, tmp_path / "again")
+    monkeypatch.setattr(run_grid, "start_devices", lambda grid: jax.devices()[:1])
+    return lambda: run_grid.main(runs.command(folder)[3:])
+
+
+def test_a_signal_among_the_figures_ends_a_run_at_once(again, monkeypatch, capfd):
+    monkeypatch.setattr(conclusion, "conclude", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    assert again() == 130
+    assert capfd.readouterr() == ("", f"run_grid: stopped at once; {CONTINUE}")
+
+
+def test_a_signal_before_the_figures_is_obeyed(again, monkeypatch, capfd):
+    finished = results.finished
+
+    def signalled(folder):
+        signal.raise_signal(signal.SIGINT)
+        return finished(folder)
+
+    monkeypatch.setattr(results, "finished", signalled)
+    assert again() == 130
+    assert capfd.readouterr().err == f"run_grid: stopped by SIGINT; {CONTINUE}"
 
 
 def test_a_second_process_is_refused_and_a_crash_frees_the_folder(runs, whole, tmp_path):

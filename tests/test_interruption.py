@@ -1,5 +1,6 @@
 import os
 import signal
+import sys
 
 import pytest
 
@@ -34,6 +35,43 @@ def test_a_signal_sent_twice_is_one():
         os.kill(os.getpid(), signal.SIGINT)
         with pytest.raises(Interrupted, match="SIGTERM"):
             noted.stop()
+
+
+def test_a_signal_is_noted_where_nobody_reads_the_notice():
+    before = os.dup(1)
+    reader, writer = os.pipe()
+    os.close(reader)
+    os.dup2(writer, 1)
+    try:
+        with interruption.noted("Stopping") as noted:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert noted.came()
+    finally:
+        os.dup2(before, 1)
+        os.close(before)
+        os.close(writer)
+
+
+def test_a_notice_goes_into_no_other_file(monkeypatch, capfd):
+    monkeypatch.setattr(sys, "__stdout__", None)
+    with interruption.noted("Stopping") as noted:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert noted.came()
+    assert capfd.readouterr().out == ""
+
+
+def test_a_signal_acts_at_once_when_there_is_nothing_left_to_save():
+    with interruption.noted("Stopping") as noted:
+        noted.release()
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_signal_that_came_before_is_obeyed_then():
+    with interruption.noted() as noted:
+        os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(Interrupted, match="SIGTERM"):
+            noted.release()
 
 
 def test_handlers_are_put_back_after_an_error():
