@@ -2,9 +2,12 @@
 
 import contextlib
 import dataclasses
+import errno
 import functools
+import os
 import shutil
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -128,7 +131,7 @@ def run(
                 interruption,
                 found["identity"],
             )
-            with compilation.counted() as cost, _within_memory():
+            with compilation.counted() as cost, _within_memory(grid.folder):
                 _train_cells(session, given, todo)
             console.print(
                 f"Compilation took {cost.seconds:.1f} s; {cost.hits} programs came from the cache, "
@@ -149,17 +152,20 @@ def run(
 
 
 @contextlib.contextmanager
-def _within_memory() -> Iterator[None]:
+def _within_memory(folder: Path) -> Iterator[None]:
+    """Turn a want of memory into an OSError, or a refusal as long as there is nothing to keep."""
     try:
         yield
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
         said = ("RESOURCE_EXHAUSTED", "Out of memory")
-        if isinstance(error, MemoryError) or any(words in str(error) for words in said):
-            raise UserError(
-                "the machine's memory is too small for this; give fewer --seeds, --max-steps or "
-                "--evaluation-starts, or smaller networks"
-            ) from error
-        raise
+        if not isinstance(error, MemoryError) and not any(words in str(error) for words in said):
+            raise
+        if results.begun(folder) or any((folder / "checkpoints").glob("*/*")):
+            raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)) from error
+        raise UserError(
+            "the machine's memory is too small for this; give fewer --seeds, --max-steps or "
+            "--evaluation-starts, or smaller networks"
+        ) from error
 
 
 def _train_cells(session: _Session, given: Demonstrations | None, todo: list[Cell]) -> None:

@@ -231,15 +231,33 @@ def test_metadata_that_no_table_can_hold_is_refused(refused, tmp_path, metadata,
     assert named in refused(*SMOKE, "--demos", "pool.npz", "--out", "run")
 
 
-def test_a_run_that_does_not_fit_in_memory_is_refused(refused, monkeypatch):
-    said = ("RESOURCE_EXHAUSTED: of no use", "INTERNAL: Out of memory allocating 9 bytes")
-    for error in (MemoryError(), *map(jax.errors.JaxRuntimeError, said)):
+SHORT_OF_MEMORY = (
+    MemoryError(),
+    jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: of no use"),
+    jax.errors.JaxRuntimeError("INTERNAL: Out of memory allocating 9 bytes"),
+)
 
-        def make_pool(*_, error=error):
-            raise error
 
-        monkeypatch.setattr(experts, "make_pool", make_pool)
-        assert "memory is too small" in refused(*SMOKE, "--out", "run")
+@pytest.mark.parametrize("error", SHORT_OF_MEMORY)
+def test_a_run_that_does_not_fit_in_memory_is_refused(refused, monkeypatch, error):
+    def make_pool(*_):
+        raise error
+
+    monkeypatch.setattr(experts, "make_pool", make_pool)
+    assert "memory is too small" in refused(*SMOKE, "--out", "run")
+
+
+def test_a_run_that_runs_out_of_memory_keeps_its_checkpoints(main, monkeypatch, tmp_path, capsys):
+    saved = tmp_path / "run" / "checkpoints" / "experts" / "250"
+
+    def make_pool(*_):
+        saved.mkdir(parents=True)
+        raise MemoryError
+
+    monkeypatch.setattr(experts, "make_pool", make_pool)
+    assert main(*SMOKE, "--out", "run") == 1
+    assert "Cannot allocate memory; what is finished is kept" in capsys.readouterr().err
+    assert saved.exists()
 
 
 @pytest.mark.parametrize("out", ["file", "file/run"])
