@@ -6,9 +6,7 @@ learners with different demonstrations share one array, and nothing is ragged.
 """
 
 import json
-import math
 import stat
-import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,14 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks, disk
+from cmedirl_jax import checks, disk, npz
 from cmedirl_jax.types import Array, EnvSpec, Numeric, Transition
 
 FORMAT = "cmedirl_jax.demonstrations"
 FORMAT_VERSION = 1
-
-_DEFLATE_RATIO = 1032
-"""No deflate stream is longer unpacked than so many times its length."""
 
 
 class Demonstrations(NamedTuple):
@@ -287,38 +282,10 @@ def load(path: str | Path, spec: EnvSpec | None = None) -> Demonstrations:
 
 
 def _read(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
-    names = ["header", *Transition._fields, "truncated", "episode"]
     try:
-        with zipfile.ZipFile(path) as archive:
-            for name in names:
-                _check_size(archive, f"{name}.npy", path.stat().st_size)
-            header, *arrays = (_read_array(archive, f"{name}.npy") for name in names)
-            return json.loads(str(header[()])), dict(zip(names[1:], arrays, strict=True))
+        arrays = npz.read(path, ("header", *Transition._fields, "truncated", "episode"))
+        return json.loads(str(arrays.pop("header")[()])), arrays
     except Exception as error:
         # A damaged archive raises whatever zipfile, zlib, json or numpy happen to stumble over.
         reason = " ".join(str(error).split())
         raise ValueError(f"{path}: not a readable demonstrations file ({reason})") from error
-
-
-def _check_size(archive: zipfile.ZipFile, name: str, length: int) -> None:
-    """Refuse an array that claims more bytes than a file of this length can hold, unread."""
-    entry = archive.getinfo(name)
-    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"{name} is compressed by another method")
-    with archive.open(entry) as file:
-        major, _ = np.lib.format.read_magic(file)
-        read_header = {
-            1: np.lib.format.read_array_header_1_0,
-            2: np.lib.format.read_array_header_2_0,
-        }[major]
-        shape, _, dtype = read_header(file)
-        size = file.tell() + math.prod(shape) * dtype.itemsize
-    if dtype.hasobject:
-        raise ValueError(f"{name} holds pickled objects")
-    if size != entry.file_size or size > _DEFLATE_RATIO * min(entry.compress_size, length):
-        raise ValueError(f"{name} claims {size} bytes, which are not there")
-
-
-def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    with archive.open(name) as file:
-        return np.lib.format.read_array(file, allow_pickle=False)
