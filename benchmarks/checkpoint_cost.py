@@ -13,14 +13,16 @@ import tyro
 from rich.console import Console
 
 from benchmarks import measuring, ours
-from cmedirl_jax.methods import Settings
-from experiments import cells, checkpoints, compilation
-from experiments.bookkeeping import Budget
-from experiments.checkpoints import Keeper
-from experiments.errors import UserError
-from experiments.interruption import Interruption
-from experiments.presets import Grid
-from experiments.programs import Programs
+from cmedirl_jax.runs.cells import cell as cell_lib
+from cmedirl_jax.runs.cells.compiled import Programs
+from cmedirl_jax.runs.cells.record import Budget
+from cmedirl_jax.runs.config import StudyConfig
+from cmedirl_jax.runs.console import compile_cache
+from cmedirl_jax.runs.console.signals import Interruption
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import checkpoints
+from cmedirl_jax.runs.storage.checkpoints import Keeper
+from cmedirl_jax.training.methods import Settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +58,7 @@ class _Timed(Keeper):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; returns the exit code."""
     options = tyro.cli(Options, prog="python -m benchmarks.checkpoint_cost", args=arguments)
-    compilation.use_cache()
+    compile_cache.use_cache()
     jax.config.update("jax_num_cpu_devices", max(1, measuring.cores()))
     compiled = ours.compile_programs("ddpg", Settings(), jax.devices(), seeds_count=options.seeds)
     try:
@@ -71,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"training stood still for {result['blocked_seconds']:.3f} s each; one every "
         f"{options.every:g} s took {result['cost']:.1%} ({result['cost_low']:.1%} to "
         f"{result['cost_high']:.1%} over {options.rounds} rounds) of the time. At one every "
-        f"{Grid.checkpoint_every:g} s, the default: {result['cost_by_default']:.2%}.",
+        f"{StudyConfig.checkpoint_every:g} s, the default: {result['cost_by_default']:.2%}.",
         highlight=False,
     )
     if options.json is not None:
@@ -88,7 +90,7 @@ def measure(options: Options, compiled: Programs) -> dict[str, object]:
 
     def seconds(keeper: Keeper | None) -> float:
         began = time.perf_counter()
-        cells.train(
+        cell_lib.train(
             compiled,
             jax.random.key(0),
             None,
@@ -137,7 +139,7 @@ def measure(options: Options, compiled: Programs) -> dict[str, object]:
         "cost": cost,
         "cost_low": min(ratios) - 1.0,
         "cost_high": max(ratios) - 1.0,
-        "cost_by_default": cost * options.every / Grid.checkpoint_every,
+        "cost_by_default": cost * options.every / StudyConfig.checkpoint_every,
     }
 
 

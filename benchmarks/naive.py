@@ -15,8 +15,8 @@ import optax
 
 from benchmarks.workload import CAPACITY, Workload
 from cmedirl_jax import envs
-from cmedirl_jax.demonstrations import Demonstrations
-from cmedirl_jax.methods import METHODS
+from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.training.methods import METHODS
 
 DISCOUNT, TAU, PENALTY, THETA, SIGMA = 0.99, 0.01, 1e-3, 0.15, 0.5
 BOUND, OUTPUT_PENALTY, REWARD_PERIOD = 0.1, 0.05, 4

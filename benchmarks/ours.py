@@ -7,16 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.workload import CAPACITY, Workload
-from cmedirl_jax import envs, hot_start, seeds
-from cmedirl_jax.demonstrations import Demonstrations
-from cmedirl_jax.hot_start import HotStartHParams
-from cmedirl_jax.methods import METHODS, RewardNetworkSettings, Settings
+from cmedirl_jax import envs
+from cmedirl_jax.agents import hot_start
+from cmedirl_jax.agents.hot_start import HotStartHParams
+from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.irl.reward_batches import RewardBatchSettings
 from cmedirl_jax.networks import Architecture
-from cmedirl_jax.schedules import RewardSchedule, Schedule
-from experiments import judging
-from experiments import programs as programs_lib
-from experiments.lanes import Lanes
-from experiments.programs import Programs
+from cmedirl_jax.runs.cells import compiled as programs_lib
+from cmedirl_jax.runs.cells import evaluator as evaluator_lib
+from cmedirl_jax.runs.cells.compiled import Programs
+from cmedirl_jax.runs.cells.slots import Lanes
+from cmedirl_jax.training import seeds
+from cmedirl_jax.training.methods import METHODS, RewardNetworkSettings, Settings
+from cmedirl_jax.training.schedules import RewardSchedule, Schedule
 
 
 def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
@@ -28,7 +31,8 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         ),
         # Never frozen, so that its cost is the same however long the benchmark runs.
         reward_network=RewardNetworkSettings(hidden=workload.hidden),
-        reward_schedule=RewardSchedule(stop=None, batch_size=workload.batch),
+        reward_batches=RewardBatchSettings(batch_size=workload.batch),
+        reward_schedule=RewardSchedule(stop=None),
         # The hot start is over before anything is timed; it need not be a good one.
         hot_start=HotStartHParams(steps=20),
         # At once, for a call that only collected would look fast; the cloning never fades either.
@@ -78,7 +82,7 @@ def compile_programs(
         env,
         METHODS[method],
         settings,
-        judging.of_networks(env, architecture, group, devices),
+        evaluator_lib.of_networks(env, architecture, group, devices),
         programs_lib.compile_networks(env, architecture, group, devices),
         group=group,
         seeds_count=seeds_count,

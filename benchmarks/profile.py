@@ -20,9 +20,10 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.workload import CAPACITY
-from cmedirl_jax import envs, seeds, training
-from cmedirl_jax.methods import METHODS, Settings
+from cmedirl_jax import envs, training
 from cmedirl_jax.networks import Architecture
+from cmedirl_jax.training import seeds
+from cmedirl_jax.training.methods import METHODS, Settings
 
 STEPS = 250
 

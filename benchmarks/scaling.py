@@ -22,11 +22,12 @@ import numpy as np
 import tyro
 
 from benchmarks import measuring, ours
-from cmedirl_jax import seeds
-from cmedirl_jax.methods import Settings
-from experiments import cells, distributed
-from experiments import programs as programs_lib
-from experiments.lanes import Lanes
+from cmedirl_jax.runs.cells import cell as cell_lib
+from cmedirl_jax.runs.cells import compiled as programs_lib
+from cmedirl_jax.runs.cells.slots import Lanes
+from cmedirl_jax.runs.cluster import exchange
+from cmedirl_jax.training import seeds
+from cmedirl_jax.training.methods import Settings
 
 GROUPS = {"1 process x 2 devices": (1, 2), "2 processes x 1 device": (2, 1), "its share": (1, 1)}
 """Processes, and devices of each."""
@@ -124,8 +125,8 @@ def work(
     jax.config.update("jax_num_cpu_devices", devices)
     if processes > 1:
         jax.distributed.initialize(coordinator, processes, index)
-    spread_over = distributed.devices(devices, seeds_count)
-    distributed.connect(spread_over)
+    spread_over = exchange.devices(devices, seeds_count)
+    exchange.connect(spread_over)
     programs = ours.compile_programs(method, Settings(), spread_over, seeds_count=seeds_count)
     lanes = Lanes(programs.lanes, seeds_count, programs.group, programs.devices)
     state = programs_lib.begin(programs, lanes, jax.random.key(0), None, 0)
@@ -140,7 +141,7 @@ def work(
         # The first turn compiles, and its first chunk learns nothing before step 200.
         for last in (True,) if warm else (False, False, True):
             times = {}
-            steps = jnp.arange(begun, begun + cells.CHUNK, dtype=jnp.int32)
+            steps = jnp.arange(begun, begun + cell_lib.CHUNK, dtype=jnp.int32)
             before = time.perf_counter()
             state, log = jax.block_until_ready(programs.run(state, groups, None, steps, None))
             times["chunk_s"] = time.perf_counter() - before
@@ -149,9 +150,9 @@ def work(
             for array in extra:
                 timed(times, f"gather_{array.nbytes}_bytes", array)
             before = time.perf_counter()
-            distributed.any_process(False)
+            exchange.any_process(False)
             times["flag_s"] = time.perf_counter() - before
-            begun += cells.CHUNK
+            begun += cell_lib.CHUNK
             warm = last
         print(json.dumps(times), flush=True)
 
@@ -159,7 +160,7 @@ def work(
 def timed(times: dict[str, float], name: str, tree: Any) -> None:
     """Gather a tree; note the seconds."""
     before = time.perf_counter()
-    distributed.gather(tree)
+    exchange.gather(tree)
     times[f"{name}_s"] = time.perf_counter() - before
 
 

@@ -20,7 +20,7 @@ from rich.table import Table
 from benchmarks import measuring, plots
 from benchmarks.measuring import Comparison
 from benchmarks.workload import Workload
-from cmedirl_jax.methods import PAPER_METHODS
+from cmedirl_jax.training.methods import PAPER_METHODS
 
 SEEDS = (1, 8, 32, 100, 1000)
 WIDTHS = ((64, 64), (128, 128), (400, 300))

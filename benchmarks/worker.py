@@ -10,8 +10,9 @@ from benchmarks import naive, ours
 from benchmarks.serving import serve
 from benchmarks.workload import Workload
 from cmedirl_jax import envs
-from cmedirl_jax.demonstrations import Demonstrations
-from experiments import compilation, experts
+from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.runs.cells import experts
+from cmedirl_jax.runs.console import compile_cache
 
 
 def demonstrations(episodes: int) -> Demonstrations:
@@ -33,9 +34,9 @@ def main() -> None:
     workload = Workload(**{**options, "hidden": tuple(options["hidden"])})
     jax.config.update("jax_num_cpu_devices", workload.devices)
     if jax.config.jax_compilation_cache_dir is not None:
-        compilation.use_cache()
+        compile_cache.use_cache()
     variant = {"ours": ours, "naive": naive}[workload.variant]
-    with compilation.counted() as cost:
+    with compile_cache.counted() as cost:
         advance = variant.start(workload, demonstrations(workload.n_demos))
         serve(
             advance,

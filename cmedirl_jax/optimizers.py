@@ -1,11 +1,19 @@
-"""Adam at a learning rate that is data, not a closure."""
+"""Hyperparameters as leaves of a state, and Adam at a learning rate that is such a leaf."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import optax
 
 from cmedirl_jax.types import Numeric
+
+HParams = TypeVar("HParams")
+
+
+def traced(hparams: HParams) -> HParams:
+    """The numbers as float32 arrays, so that a state has one type whoever made it."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams)
 
 
 def adam() -> optax.GradientTransformationExtraArgs:

@@ -22,9 +22,10 @@ from rich.console import Console
 from rich.table import Table
 
 from cmedirl_jax import envs
-from experiments import results, statistics
-from experiments.errors import UserError
-from experiments.statistics import SeedStatistics
+from cmedirl_jax.runs import statistics
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.statistics import SeedStatistics
+from cmedirl_jax.runs.storage import sealing
 
 MEASURES: dict[str, Callable[[SeedStatistics, int], np.ndarray]] = {
     "convergence_env_step": lambda seeds, most: np.minimum(seeds.convergence_env_step, most),
@@ -60,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"compare: {error}", file=sys.stderr)
         return 2
     if options.out is not None:
-        with results.replacing(options.out) as partial:
+        with sealing.replacing(options.out) as partial:
             table.write_csv(partial)
     Console(width=None if sys.stdout.isatty() else 120).print(shown(table, options.against))
     return 0
@@ -139,7 +140,7 @@ def holm(p_values: np.ndarray) -> np.ndarray:
 
 def _seed_statistics(folder: Path, threshold: float) -> dict[tuple[str, int], SeedStatistics]:
     """Of every cell whose method acts, its seeds' statistics."""
-    tables = results.read(folder)
+    tables = sealing.read(folder)
     by_cell = ["method", "n_demos"]
     diverged = {
         key: group.sort("seed")["diverged"].to_numpy()

@@ -2,17 +2,20 @@
 
 import polars as pl
 
-from cmedirl_jax import demonstrations
+from cmedirl_jax.data import demonstrations
 from cmedirl_jax.envs import Env
-from experiments import figures, kept_pool, results, statistics
-from experiments.planning import Cell
-from experiments.presets import Grid
+from cmedirl_jax.runs import statistics
+from cmedirl_jax.runs.config import StudyConfig
+from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
+from cmedirl_jax.runs.storage import sealing
+from cmedirl_jax.runs.validation import Cell
+from experiments import figures
 
 
-def conclude(grid: Grid, env: Env, plan: list[Cell], *, redraw: bool) -> pl.DataFrame:
+def conclude(grid: StudyConfig, env: Env, plan: list[Cell], *, redraw: bool) -> pl.DataFrame:
     """Summarise the run's tables; draw its figures where they are not there yet."""
     folder = grid.folder
-    tables = results.read(folder)
+    tables = sealing.read(folder)
     evaluations = tables["evaluations"]
 
     def of(table: pl.DataFrame, cell: Cell) -> pl.DataFrame:
@@ -35,7 +38,7 @@ def conclude(grid: Grid, env: Env, plan: list[Cell], *, redraw: bool) -> pl.Data
     )
     if redraw or not all((folder / name).exists() for name in ("summary.csv", "figures")):
         expert = None
-        pool = kept_pool.load(folder, env)
+        pool = stored_demonstrations.load(folder, env)
         if pool is not None:
             expert = float(demonstrations.returns(pool).mean())
         figures.draw(
@@ -46,6 +49,6 @@ def conclude(grid: Grid, env: Env, plan: list[Cell], *, redraw: bool) -> pl.Data
             expert,
             env.spec.reward_threshold,
         )
-        with results.replacing(folder / "summary.csv") as partial:
+        with sealing.replacing(folder / "summary.csv") as partial:
             summary.write_csv(partial)
     return summary

@@ -20,12 +20,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from cmedirl_jax import envs, ranges
+from cmedirl_jax import envs
 from cmedirl_jax.envs import Env
+from cmedirl_jax.runs.console import compile_cache
 from cmedirl_jax.tabular import discretise, interpolation
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.tabular.optimal_control import value_iteration
-from experiments import compilation
+from cmedirl_jax.training import ranges
 
 RANGES = {
     "states": ranges.TWO_OR_MORE,
@@ -57,7 +58,7 @@ class Options:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = tyro.cli(Options, prog="python -m experiments.optimal_return", args=arguments)
-    compilation.use_cache()
+    compile_cache.use_cache()
     try:
         table = optimal_returns(options)
     except ValueError as error:

@@ -14,11 +14,14 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from experiments import compilation, distributed, heap, interruption, output, processes
-from experiments import grid as grid_lib
-from experiments.errors import UserError
-from experiments.interruption import Interrupted
-from experiments.presets import PRESETS, Grid
+from cmedirl_jax.runs import heap
+from cmedirl_jax.runs import run as grid_lib
+from cmedirl_jax.runs.cluster import exchange, processes
+from cmedirl_jax.runs.config import StudyConfig
+from cmedirl_jax.runs.console import compile_cache, signals, streams
+from cmedirl_jax.runs.console.signals import Interrupted
+from cmedirl_jax.runs.errors import UserError
+from experiments.presets import PRESETS
 
 _STOPPING = "Stopping after this chunk of steps; once more to stop at once\n"
 _CONTINUE = "start the same command again to go on"
@@ -29,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return _main(sys.argv[1:] if arguments is None else arguments)
     finally:
-        output.flush()
+        streams.flush()
 
 
 def _main(arguments: Sequence[str]) -> int:
@@ -45,19 +48,19 @@ def _main(arguments: Sequence[str]) -> int:
     return processes.guarded(lambda: work(grid))
 
 
-def work(grid: Grid) -> int:
+def work(grid: StudyConfig) -> int:
     """Do the run, or this process's share of it; returns the exit code."""
-    console = Console(file=output.dispensable())
+    console = Console(file=streams.dispensable())
     if not console.is_terminal:
-        console = Console(file=output.dispensable(), width=120)
+        console = Console(file=streams.dispensable(), width=120)
     heap.share(arenas=cores())
-    compilation.use_cache()
+    compile_cache.use_cache()
     try:
         # Before anything else: the first array that JAX makes fixes the number of CPU devices.
         devices = start_devices(grid)
-        console.quiet = not distributed.is_writer()
-        with interruption.noted(None if console.quiet else _STOPPING) as signals:
-            summary = grid_lib.run(grid, devices, console, signals)
+        console.quiet = not exchange.is_writer()
+        with signals.noted(None if console.quiet else _STOPPING) as interruption:
+            summary = grid_lib.run(grid, devices, console, interruption)
     except UserError as error:
         return _end(2, str(error))
     except Interrupted as error:
@@ -80,18 +83,18 @@ def work(grid: Grid) -> int:
 
 
 def _end(exit_code: int, line: str) -> int:
-    output.complain(f"run_grid: {line}")
+    streams.complain(f"run_grid: {line}")
     return exit_code
 
 
-def parse(arguments: Sequence[str]) -> Grid:
+def parse(arguments: Sequence[str]) -> StudyConfig:
     """The configuration: the preset's, with whatever else the command line says."""
     # The preset decides every other default, so it is read first; tyro reports a wrong one.
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", default="tuned")
     preset, _ = first.parse_known_args(list(arguments))
     return tyro.cli(
-        Grid,
+        StudyConfig,
         prog="python -m experiments.run_grid",
         description=__doc__,
         default=PRESETS.get(preset.preset, PRESETS["tuned"]),
@@ -99,7 +102,7 @@ def parse(arguments: Sequence[str]) -> Grid:
     )
 
 
-def start_devices(grid: Grid) -> list[jax.Device]:
+def start_devices(grid: StudyConfig) -> list[jax.Device]:
     """Start JAX with as many CPU devices as the run uses, or take the GPUs there are.
 
     Raises:
@@ -117,13 +120,13 @@ def start_devices(grid: Grid) -> list[jax.Device]:
     available = len(devices) if devices[0].platform != "cpu" else cores()
     refused = grid.devices is not None and grid.devices > available
     # Together: a process that left alone would keep the others waiting.
-    if distributed.any_process(refused):
+    if exchange.any_process(refused):
         there = f"there are {available}" if refused else "another process has fewer"
         raise UserError(f"--devices: {grid.devices} asked, {there}")
     if processes.is_asked(grid):
-        distributed.check_same(grid)
-        shared = distributed.devices(grid.devices, grid.seeds)
-        distributed.connect(shared)
+        exchange.check_same(grid)
+        shared = exchange.devices(grid.devices, grid.seeds)
+        exchange.connect(shared)
         return shared
     return devices[: max(grid.devices, 1)] if grid.devices is not None else devices
 

@@ -8,7 +8,7 @@ import pytest
 
 from cmedirl_jax import envs
 from cmedirl_jax.types import EnvSpec
-from tests import compiling
+from tests.support import compiling
 
 # The first example of a test compiles, so deadlines would only measure the compiler.
 hypothesis.settings.register_profile("reproducible", deadline=None, derandomize=True)

@@ -3,24 +3,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmedirl_jax import (
-    checks,
-    composition,
-    ddpg,
-    demonstrations,
-    episodes,
-    exploration,
-    hot_start,
-    irl,
-    replay,
-    rewards,
-    schedules,
-    shaping,
-    tabular,
-)
-from cmedirl_jax.demonstrations import DemonstrationSubset
-from cmedirl_jax.exploration import EpsilonGreedyHParams
-from cmedirl_jax.methods import METHODS, Settings
+from cmedirl_jax import checks, irl, tabular
+from cmedirl_jax.agents import ddpg, exploration, hot_start
+from cmedirl_jax.agents.exploration import EpsilonGreedyHParams
+from cmedirl_jax.data import demonstrations, episodes, replay
+from cmedirl_jax.data.demonstrations import DemonstrationSubset
+from cmedirl_jax.irl import rewards, shaping
+from cmedirl_jax.training import compose, schedules
+from cmedirl_jax.training.methods import METHODS, Settings
 from cmedirl_jax.types import RewardBatch, Transition
 
 
@@ -79,7 +69,7 @@ def test_a_specification_that_contradicts_itself_is_refused(skewed_spec, change,
         with pytest.raises(ValueError, match=rf"^Skewed-v0: .*{named}"):
             refuse(wrong)
     with pytest.raises(ValueError, match=named):
-        composition.compose(wrong, METHODS["ddpg"], Settings(), capacity=10)
+        compose.compose(wrong, METHODS["ddpg"], Settings(), capacity=10)
 
 
 def test_observations_without_bounds_agree_with_themselves(skewed_spec):

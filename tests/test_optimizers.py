@@ -41,3 +41,9 @@ def test_learning_rates_can_be_vmapped_over():
             batched,
             expected,
         )
+
+
+def test_hyperparameters_have_one_type_whoever_made_them():
+    made = [optimizers.traced({"rate": value, "none": None}) for value in (1, 1.0, np.float64(1.0))]
+    assert len({str(jax.tree.map(jnp.asarray, tree)) for tree in made}) == 1
+    assert made[0]["rate"].dtype == jnp.float32

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-README = Path(__file__).parent.parent / "README.md"
+README = Path(__file__).parents[1] / "README.md"
 METHOD = README.parent / "docs" / "method.md"
 
 

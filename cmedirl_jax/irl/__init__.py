@@ -1,8 +1,17 @@
 """Maximum-entropy inverse reinforcement learning from samples (Algorithm 1), and comparators."""
 
-from cmedirl_jax.irl import adversarial, base, controls, densities, objectives, regularisers
-from cmedirl_jax.irl.adversarial import GAILHParams
+from cmedirl_jax.irl import (
+    base,
+    controls,
+    gail,
+    objectives,
+    regularisers,
+    reward_batches,
+    rewards,
+    shaping,
+)
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
+from cmedirl_jax.irl.gail import GAILHParams
 from cmedirl_jax.irl.learner import IRLHParams, RewardParams, make
 
 __all__ = [
@@ -12,11 +21,13 @@ __all__ = [
     "RewardLearner",
     "RewardParams",
     "RewardState",
-    "adversarial",
     "base",
     "controls",
-    "densities",
+    "gail",
     "make",
     "objectives",
     "regularisers",
+    "reward_batches",
+    "rewards",
+    "shaping",
 ]

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks, rewards
-from cmedirl_jax.hparams import traced
-from cmedirl_jax.irl import base, regularisers
+from cmedirl_jax import checks
+from cmedirl_jax.irl import base, regularisers, rewards
 from cmedirl_jax.irl.base import RewardLearner, RewardState
 from cmedirl_jax.irl.learner import IRLHParams
+from cmedirl_jax.optimizers import traced
 from cmedirl_jax.types import EnvSpec, Network, Params
 
 PROBES = 1024

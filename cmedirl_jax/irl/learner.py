@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cmedirl_jax import checks, optimizers, rewards
-from cmedirl_jax.hparams import traced
-from cmedirl_jax.irl import base, objectives, regularisers
+from cmedirl_jax import checks, optimizers
+from cmedirl_jax.irl import base, objectives, regularisers, rewards
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.irl.objectives import Likelihood, Objective, Scored
 from cmedirl_jax.irl.regularisers import BoundKind, Gauge
+from cmedirl_jax.optimizers import traced
 from cmedirl_jax.types import EnvSpec, Network, Numeric, Params, RewardBatch, Transition
 
 

@@ -1,6 +1,6 @@
 """Maximum-entropy IRL and control with a model, by dynamic programming (Eqs. 1 and 4-9)."""
 
-from cmedirl_jax.tabular import discretise, frozen, imitation, interpolation
+from cmedirl_jax.tabular import discretise, imitation, interpolation, table_reward
 from cmedirl_jax.tabular.dynamics import SparseDynamics
 from cmedirl_jax.tabular.fixed_point import Stop
 from cmedirl_jax.tabular.interpolation import Grid
@@ -28,10 +28,10 @@ __all__ = [
     "discretise",
     "empirical_visitation",
     "expected_visitation",
-    "frozen",
     "imitation",
     "interpolation",
     "maxent_irl",
     "soft_value_iteration",
+    "table_reward",
     "value_iteration",
 ]

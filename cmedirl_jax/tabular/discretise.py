@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import lattice
+from cmedirl_jax import grids as grids_lib
 from cmedirl_jax.envs import Env, Step
 from cmedirl_jax.tabular import interpolation
 from cmedirl_jax.tabular.dynamics import SparseDynamics
@@ -72,7 +72,7 @@ def make(
     params = env.default_params if params is None else params
     states, actions = grids(spec, state_shape, action_shape)
     within = (np.arange(subsamples) + 0.5) / subsamples - 0.5
-    offsets = lattice.product(*[within] * len(states.shape))
+    offsets = grids_lib.product(*[within] * len(states.shape))
 
     def step(observation: jax.Array, action: jax.Array) -> Step:
         inside = jnp.clip(observation, spec.observation_low, spec.observation_high)

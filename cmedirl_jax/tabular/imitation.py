@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cmedirl_jax import rewards
-from cmedirl_jax.demonstrations import DemonstrationSubset
+from cmedirl_jax.agents.hot_start import HotStartData
+from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.envs import Env
-from cmedirl_jax.hot_start import HotStartData
+from cmedirl_jax.irl import rewards
 from cmedirl_jax.tabular import discretise, interpolation, maxent
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.tabular.interpolation import Grid

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import lattice
+from cmedirl_jax import grids
 from cmedirl_jax.types import Array
 
 
@@ -50,7 +50,7 @@ class Grid:
 def points(grid: Grid) -> np.ndarray:
     """All points, `[size, D]` float32, the last dimension fastest."""
     bounds = zip(grid.low, grid.high, grid.shape, strict=True)
-    return lattice.product(*(np.linspace(*axis, dtype=np.float32) for axis in bounds))
+    return grids.product(*(np.linspace(*axis, dtype=np.float32) for axis in bounds))
 
 
 def interpolate(grid: Grid, position: Array) -> tuple[jax.Array, jax.Array]:

@@ -1,0 +1,212 @@
+"""Hot start of actor and critic from demonstrations (the paper, section 3.4 and Eq. 11).
+
+The actor is regressed on the demonstrated actions. The critic is a 'DAQN': its values at `cells`
+evenly spaced actions are pushed towards a target that singles out the demonstrated one. What the
+paper writes (a softmax over actions, a squared error to a one-hot array) fits no continuous critic
+as it stands; the readings, and two losses in its place, are the values of `HotStartHParams.critic`:
+
+- "softmax" (H0, the letter): sum_k [softmax(Q(s, a_1..K))_k - 1{k = demonstrated cell}]^2
+- "one-hot" (H1): sum_k [Q(s, a_k) - 1{k = demonstrated cell}]^2, where the demonstrated action
+  itself replaces the cell nearest to it
+- "quadratic" (H2): sum_k [Q(s, a_k) - (G(s) - curvature |a_k - a_demo|^2)]^2, with G the discounted
+  return that the demonstration went on to receive: values on the scale of returns
+- "monte-carlo" (H3): [Q(s, a_demo) - G(s)]^2, on the demonstrated action alone
+- "large-margin" (H4, as in DQfD, Hester et al. 2018): max_k [Q(s, a_k) + margin 1{k != demonstrated
+  cell}] - Q(s, a_demo), at the actions of "one-hot"; it leaves the level of Q free
+"""
+
+from typing import Any, Literal, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from cmedirl_jax import checks, grids
+from cmedirl_jax import networks as networks_lib
+from cmedirl_jax.data import demonstrations as demonstrations_lib
+from cmedirl_jax.data.demonstrations import Demonstrations, DemonstrationSubset
+from cmedirl_jax.networks import ActorCritic
+from cmedirl_jax.types import Array, EnvSpec, Params, Transition
+
+
+class HotStartHParams(flax.struct.PyTreeNode):
+    """Hyperparameters; the strings and sizes are static."""
+
+    learning_rate: float = 1e-3
+    """Adam's rate for both networks."""
+    curvature: float = 20.0
+    """Of the "quadratic" critic target, per squared half-width of the action range."""
+    margin: float = 0.8
+    """Of the "large-margin" loss: by how much the demonstrated action's value is to lead."""
+    critic: Literal["softmax", "one-hot", "quadratic", "monte-carlo", "large-margin"] = (
+        flax.struct.field(pytree_node=False, default="one-hot")
+    )
+    """The critic's loss: H0 to H4, see the module's docstring."""
+    cells: int = flax.struct.field(pytree_node=False, default=11)
+    """Evenly spaced values per action dimension, bounds included; K = cells^A actions."""
+    steps: int = flax.struct.field(pytree_node=False, default=1000)
+    """Gradient steps on each network."""
+    batch_size: int = flax.struct.field(pytree_node=False, default=32)
+    """Demonstrated steps per gradient step."""
+
+
+class HotStartData(NamedTuple):
+    """A pool as the hot start reads it.
+
+    Attributes:
+        transition: leaves `[N, ...]`.
+        discounted_return: `[N]`, what each step went on to receive.
+        episodes: where the pool's episodes lie.
+    """
+
+    transition: Transition
+    discounted_return: Array
+    episodes: DemonstrationSubset
+
+
+def data(
+    demonstrations: Demonstrations, discount: float = 0.99, reward_scale: float = 1.0
+) -> HotStartData:
+    """Prepare a pool (on the host, once), for an agent of this discount and reward scale.
+
+    The returns are of the environment's reward and end with the demonstration, also where the time
+    limit cut it off.
+
+    Raises:
+        ValueError: if the discount is not between 0 and 1, or the scale not positive and finite.
+    """
+    checks.positive(reward_scale=reward_scale)
+    returns = demonstrations_lib.discounted_returns(demonstrations, discount)
+    return HotStartData(
+        demonstrations.transition,
+        (reward_scale * returns).astype(np.float32),
+        demonstrations_lib.episodes(demonstrations),
+    )
+
+
+def fit(
+    key: jax.Array,
+    networks: ActorCritic,
+    params: tuple[Params, Params],
+    demonstrations: Demonstrations | HotStartData,
+    hparams: HotStartHParams | None = None,
+    *,
+    subset: DemonstrationSubset | None = None,
+) -> tuple[Params, Params]:
+    """Fit actor and critic to demonstrations by supervised learning; optimisers are fresh.
+
+    Follow it with `agent.init(key, params)`, which copies the result to the targets.
+
+    Args:
+        key: randomness of the minibatches.
+        networks: whose parameters these are.
+        params: `(actor, critic)` to start from.
+        demonstrations: the pool; prepare it with `data` first under jit or vmap, or for an agent
+            whose discount is not 0.99.
+        hparams: hyperparameters.
+        subset: the learner's own episodes of the pool; default all.
+
+    Returns:
+        The fitted `(actor, critic)`.
+
+    Raises:
+        ValueError: if the pool is not of the networks' sizes, or a size of `hparams` not positive.
+        TypeError: if a leaf of the pool is not of its dtype.
+    """
+    hparams = hparams or HotStartHParams()
+    checks.sizes(cells=hparams.cells, steps=hparams.steps, batch_size=hparams.batch_size)
+    if isinstance(demonstrations, Demonstrations):
+        demonstrations = data(demonstrations)
+    pool = jax.tree.map(jnp.asarray, demonstrations)
+    chosen = pool.episodes if subset is None else subset
+    size = pool.transition.observation.shape[:1]
+    checks.transition_shapes(networks.spec, pool.transition, size, "demonstrations")
+    checks.shape("discounted_return", pool.discounted_return, size)
+    checks.shape("subset.length", chosen.length, jnp.shape(chosen.start)[:1])
+    optimizer = optax.adam(hparams.learning_rate)
+
+    def loss(params: tuple[Params, Params], index: jax.Array):
+        actor, critic = params
+        observation = pool.transition.observation[index]
+        action = pool.transition.action[index]
+        actor_error, actor = networks_lib.imitation_error(networks, actor, observation, action)
+        critic_error, critic = critic_loss(
+            networks, critic, hparams, observation, action, pool.discounted_return[index]
+        )
+        # Disjoint parameters: the gradient of the sum is each network's own.
+        return actor_error + critic_error, (actor, critic)
+
+    def step(carry: tuple[Any, optax.OptState], key: jax.Array):
+        params, state = carry
+        index = demonstrations_lib.sample_index(key, chosen, hparams.batch_size)
+        grads, params = jax.grad(loss, has_aux=True)(params, index)
+        updates, state = optimizer.update(grads, state, params)
+        params: Any = optax.apply_updates(params, updates)
+        return (params, state), None
+
+    (fitted, _), _ = jax.lax.scan(
+        step, (params, optimizer.init(params)), jax.random.split(key, hparams.steps)
+    )
+    return fitted
+
+
+def critic_loss(
+    networks: ActorCritic,
+    critic: Params,
+    hparams: HotStartHParams,
+    observation: jax.Array,
+    action: jax.Array,
+    discounted_return: jax.Array,
+) -> tuple[jax.Array, Params]:
+    """Eq. 11 as `hparams.critic` reads or replaces it, averaged over the batch, and the params.
+
+    Args:
+        networks: whose critic.
+        critic: its parameters.
+        hparams: which loss, how many cells, the curvature, the margin.
+        observation: `[B, O]`.
+        action: `[B, A]`, demonstrated.
+        discounted_return: `[B]`, read by "quadratic" and "monte-carlo" alone.
+    """
+    evaluate = networks_lib.train_mode(networks.critic)
+    if hparams.critic == "monte-carlo":
+        q, critic = evaluate(critic, observation, action)
+        return jnp.mean(jnp.square(q - discounted_return)), critic
+    spec = networks.spec
+    half_width = 0.5 * (spec.action_high - spec.action_low)
+    cells = jnp.asarray(action_cells(spec, hparams.cells))
+    squared_distance = jnp.sum(
+        jnp.square((cells - action[:, None, :]) / half_width), axis=-1
+    )  # [B, K]
+    nearest = jax.nn.one_hot(jnp.argmin(squared_distance, axis=-1), len(cells))
+    actions = jnp.broadcast_to(cells, (*squared_distance.shape, spec.action_dim))
+    if hparams.critic in ("one-hot", "large-margin"):
+        actions = jnp.where(nearest[..., None] > 0, action[:, None, :], actions)
+    observations = jnp.broadcast_to(
+        observation[:, None, :], (*squared_distance.shape, spec.observation_dim)
+    )
+    q, critic = evaluate(critic, observations, actions)
+    match hparams.critic:
+        case "softmax":
+            error = _squared_error(jax.nn.softmax(q, axis=-1), nearest)
+        case "one-hot":
+            error = _squared_error(q, nearest)
+        case "quadratic":
+            target = discounted_return[:, None] - hparams.curvature * squared_distance
+            error = _squared_error(q, target)
+        case "large-margin":
+            best = jnp.max(q + hparams.margin * (1.0 - nearest), axis=-1)
+            error = best - jnp.sum(nearest * q, axis=-1)
+    return jnp.mean(error), critic
+
+
+def _squared_error(q: jax.Array, target: jax.Array) -> jax.Array:
+    """Summed over the cells: `[B, K]` -> `[B]`."""
+    return jnp.sum(jnp.square(q - target), axis=-1)
+
+
+def action_cells(spec: EnvSpec, cells: int) -> np.ndarray:
+    """The product grid of `cells` values per action dimension, bounds included: `[cells^A, A]`."""
+    return grids.product(*np.linspace(spec.action_low, spec.action_high, cells).T)

@@ -1,0 +1,126 @@
+"""Networks for the learned reward r_D(s, a; theta), deep or linear (the paper, section 2.2, Eq. 1).
+
+    network = rewards.linear(spec, rewards.fourier(spec, order=3))
+
+All take an observation `[..., O]` and an action `[..., A]`, floats with the same leading axes, else
+ValueError, or TypeError for other dtypes; those of the inputs "state" ignore the action.
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax import checks, grids, networks
+from cmedirl_jax.types import Array, EnvSpec, Network, Params
+
+Inputs = Literal["state-action", "state"]
+"""Whether a reward is r(s, a) or r(s)."""
+
+Features = Callable[[Array, Array], jax.Array]
+"""phi: observation `[..., O]`, action `[..., A]` -> `[..., F]`."""
+
+
+def mlp(
+    spec: EnvSpec, hidden: tuple[int, ...] = (64, 64), inputs: Inputs = "state-action"
+) -> Network:
+    """A deep reward: observation `[..., O]`, action `[..., A]` -> `[...]`, before any bound.
+
+    The critic's shape without its normalisation: the observation, scaled to [-1, 1], and the action
+    joined at the input. Of the state alone: the actor's, with one output.
+
+    Raises:
+        ValueError: if the observation has an infinite bound.
+    """
+    architecture = networks.Architecture(hidden=hidden, critic_normalisation="none")
+    if inputs == "state-action":
+        network = networks.critic(spec, architecture)
+
+        def apply(params: Params, observation: Array, action: Array) -> jax.Array:
+            checks.pairs(spec, observation, action)
+            return network.apply(params, observation, action)
+
+        return network._replace(apply=apply)
+    of_state = networks.scalar_output(networks.actor(spec._replace(action_dim=1), architecture))
+
+    def apply_to_state(params: Params, observation: Array, action: Array) -> jax.Array:
+        del action
+        checks.pairs(spec, observation)
+        return of_state.apply(params, observation)
+
+    return of_state._replace(apply=apply_to_state)
+
+
+def linear(spec: EnvSpec, features: Features) -> Network:
+    """theta^T phi (Eq. 1): observation `[..., O]`, action `[..., A]` -> `[...]`; theta is `[F]`.
+
+    It starts from theta = 0 whatever the key: no symmetry is to be broken, without a bound the
+    likelihood is concave in theta, and a reward of zero prefers nothing.
+    """
+    size = jax.eval_shape(features, spec.observation_low, spec.action_low).shape[-1]
+    return Network(
+        init=lambda key: jnp.zeros(size),
+        apply=lambda theta, observation, action: features(observation, action) @ theta,
+    )
+
+
+def radial_basis(spec: EnvSpec, centres: int, inputs: Inputs = "state-action") -> Features:
+    """Features of a linear reward (Eq. 1): `centres^O` Gaussians of the observation.
+
+    They lie on a regular grid of `centres` per dimension over its bounds, as wide as they lie apart
+    and normalised to sum to one. Of "state-action": times 1, a and a^2 of each action, so that the
+    reward is a quadratic of the action whose coefficients vary over the states.
+
+    Raises:
+        ValueError: if there are fewer than two centres, or the observation has an infinite bound.
+    """
+    if centres < 2:
+        raise ValueError(f"radial basis functions need two centres or more, got {centres}")
+    scale = networks.observation_scaling(spec)
+    axis = np.linspace(-1.0, 1.0, centres)
+    grid = grids.product(*[axis] * spec.observation_dim)
+    width = axis[1] - axis[0]
+
+    def features(observation: Array, action: Array) -> jax.Array:
+        checks.pairs(spec, observation, None if inputs == "state" else action)
+        away = (scale(jnp.asarray(observation))[..., None, :] - grid) / width
+        local = jax.nn.softmax(-0.5 * jnp.sum(jnp.square(away), axis=-1), axis=-1)
+        if inputs == "state":
+            return local
+        of_action = jnp.concatenate(
+            [jnp.ones_like(action[..., :1]), action, jnp.square(action)], axis=-1
+        )
+        both = local[..., :, None] * of_action[..., None, :]
+        return both.reshape(*both.shape[:-2], -1)
+
+    return features
+
+
+def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Features:
+    """Features of a linear reward (Eq. 1): the Fourier basis of Konidaris et al. (2011).
+
+    cos(pi c.x) for every c in {0, ..., order}^d, the last dimension fastest; x are the `d` inputs
+    scaled to [0, 1], the observation and then the action.
+
+    Raises:
+        ValueError: if the order is less than one, or an input has an infinite bound.
+    """
+    if order < 1:
+        raise ValueError(f"a Fourier basis needs an order of one or more, got {order}")
+    low, high = spec.observation_low, spec.observation_high
+    if inputs == "state-action":
+        low, high = np.append(low, spec.action_low), np.append(high, spec.action_high)
+    if not np.isfinite([low, high]).all():
+        raise ValueError(f"{spec.id}: a Fourier basis needs finite bounds, got {low} and {high}")
+    frequencies = np.pi * grids.product(*[np.arange(order + 1.0)] * len(low))
+
+    def features(observation: Array, action: Array) -> jax.Array:
+        checks.pairs(spec, observation, None if inputs == "state" else action)
+        if inputs == "state-action":
+            observation = jnp.concatenate([observation, action], axis=-1)
+        x = (observation - low) / (high - low)
+        return jnp.cos(jnp.sum(x[..., None, :] * frequencies, axis=-1))
+
+    return features

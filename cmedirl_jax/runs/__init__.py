@@ -1,0 +1,1 @@
+"""Runs of many seeds that are never lost: configuration, cells, results on disk."""

@@ -1,0 +1,294 @@
+"""Training one cell of the grid: a method, a number of demonstrations, all seeds together."""
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax.agents.hot_start import HotStartData
+from cmedirl_jax.runs.cells import evaluator as evaluator_lib
+from cmedirl_jax.runs.cells.compiled import Programs, begin, pack
+from cmedirl_jax.runs.cells.record import Book, Budget, EpisodeRows, EvaluationRows
+from cmedirl_jax.runs.cells.slots import Lanes
+from cmedirl_jax.runs.cluster import exchange
+from cmedirl_jax.runs.storage.checkpoints import Keeper, Snapshot
+from cmedirl_jax.training import TrainingState
+from cmedirl_jax.training.evaluation import Evaluation
+
+CHUNK = 250
+"""Steps per call of the compiled training loop, and so between looks at the seeds from the host."""
+
+
+class Progress(NamedTuple):
+    """Where a cell stands after a chunk: steps taken by each seed, share at the threshold."""
+
+    env_step: int
+    solved_fraction: float
+
+
+class CellResult(NamedTuple):
+    """A finished cell.
+
+    Attributes:
+        evaluations: in the order they were made.
+        episodes: in the order they ended.
+        best: actor parameters `[seeds, ...]`, each seed's at its highest evaluation.
+        reward: learned rewards' parameters `[seeds, ...]`, or None.
+        env_steps: `[seeds]`, steps each learned from.
+        demonstration_steps: `[seeds]`, environment steps in each seed's own demonstrations.
+        diverged: `[seeds]` bool, stopped because a parameter was no longer finite.
+        final: actor parameters `[seeds, ...]` at the end.
+    """
+
+    evaluations: list[EvaluationRows]
+    episodes: EpisodeRows
+    best: Any
+    reward: Any
+    env_steps: np.ndarray
+    demonstration_steps: np.ndarray
+    diverged: np.ndarray
+    final: Any
+
+
+def train(
+    programs: Programs,
+    key: jax.Array,
+    data: HotStartData | None,
+    n_demos: int,
+    *,
+    seeds_count: int,
+    budget: Budget,
+    threshold: float,
+    report: Callable[[Progress], None],
+    keeper: Keeper | None = None,
+) -> CellResult:
+    """Train a cell.
+
+    Args:
+        programs: of the cell's method.
+        key: the cell's randomness.
+        data: the demonstrations; None for a method without.
+        n_demos: how many of them each seed draws.
+        seeds_count: how many seeds.
+        budget: how long they train, and when they are evaluated.
+        threshold: return that counts as solved, for the reports alone.
+        report: called where training begins or goes on from, and after each chunk.
+        keeper: saves the training as it goes, and has what was saved of it before.
+
+    Raises:
+        Interrupted: by the keeper.
+    """
+
+    lanes = Lanes(programs.lanes, seeds_count, programs.group, programs.devices)
+
+    def init() -> TrainingState:
+        return begin(programs, lanes, key, data, n_demos)
+
+    abstract = functools.cache(lambda: jax.eval_shape(init))
+    saved = None
+    if keeper is not None:
+        saved = keeper.load(lambda record: _Training.saved_like(abstract(), seeds_count, record))
+    if saved is None:
+        training = _Training.begin(programs, data, budget, lanes, init())
+    else:
+        training = _Training.go_on(programs, data, budget, lanes, abstract(), saved)
+    report(Progress(training.step, training.book.solved_fraction(threshold)))
+    for stop in _chunk_ends(training.step, budget):
+        if not training.book.running.any():
+            break
+        training.advance(stop)
+        report(Progress(stop, training.book.solved_fraction(threshold)))
+        if keeper is not None:
+            keeper.visit(stop, training.snapshot)
+    return training.result()
+
+
+class _Training:
+    """A cell in training: its seeds in their lanes, their record, and the best policy of each."""
+
+    def __init__(
+        self,
+        programs: Programs,
+        data: HotStartData | None,
+        book: Book,
+        lanes: Lanes,
+        state: TrainingState,
+    ):
+        self.programs, self.data, self.book = programs, data, book
+        self.lanes, self.state, self.step = lanes, state, 0
+        self.best: Any = None
+        self.best_return: Any = None
+
+    @classmethod
+    def begin(
+        cls,
+        programs: Programs,
+        data: HotStartData | None,
+        budget: Budget,
+        lanes: Lanes,
+        state: TrainingState,
+    ) -> "_Training":
+        training = cls(programs, data, Book(lanes.seeds, budget), lanes, state)
+        every = np.arange(lanes.seeds)
+        found = training._evaluate(
+            budget.evaluation_starts, lanes.groups(np.ones(lanes.seeds, bool))
+        )
+        training.best = _take(state.agent.actor, lanes.of_seed)
+        training.best_return = jnp.asarray(found.return_mean)
+        training.book.evaluated("steps", every, found)
+        return training
+
+    @classmethod
+    def go_on(
+        cls,
+        programs: Programs,
+        data: HotStartData | None,
+        budget: Budget,
+        lanes: Lanes,
+        abstract: TrainingState,
+        saved: Snapshot,
+    ) -> "_Training":
+        lane_seed = saved.record.pop("lane_seed")
+        state = saved.state["training"]
+        if lane_seed.size == lanes.seed.size:
+            # Lane by lane as it was: elsewhere in its group a seed might round otherwise.
+            lanes.seed = lane_seed
+        else:
+            lane = np.argsort(lane_seed)[np.minimum(lanes.seed, lanes.seeds - 1)]
+            state = jax.tree.map(lambda leaf: leaf[lane], state)
+        state = jax.tree.map(_typed, abstract, jax.device_put(state, programs.sharding))
+        training = cls(programs, data, Book.of_record(saved.record, budget), lanes, state)
+        training.step = saved.step
+        training.best, training.best_return = saved.state["best"], saved.state["best_return"]
+        return training
+
+    @staticmethod
+    def saved_like(
+        abstract: TrainingState, seeds_count: int, record: dict[str, np.ndarray]
+    ) -> dict[str, Any]:
+        """The tree that `snapshot` saved along with `record`, with shapes for arrays."""
+
+        def sized(count: int, tree: Any) -> Any:
+            return jax.tree.map(
+                lambda leaf: jax.ShapeDtypeStruct((count, *leaf.shape[1:]), leaf.dtype), tree
+            )
+
+        state = jax.eval_shape(lambda state: jax.tree.map(_untyped, state), abstract)
+        return {
+            "training": sized(record["lane_seed"].size, state),
+            "best": sized(seeds_count, state.agent.actor),
+            "best_return": jax.ShapeDtypeStruct((seeds_count,), jnp.float32),
+        }
+
+    def snapshot(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """State and record, on the host and apart from what training writes over."""
+        tree = {
+            "training": jax.tree.map(_untyped, self.state),
+            "best": self.best,
+            "best_return": self.best_return,
+        }
+        record = {"lane_seed": self.lanes.seed.copy(), **self.book.record()}
+        return jax.tree.map(np.array, exchange.gather(tree)), record
+
+    def advance(self, stop: int) -> None:
+        """Take the steps up to `stop`, and evaluate the seeds that are due."""
+        book, budget, lanes = self.book, self.book.budget, self.lanes
+        active = book.running | (book.pending & ~book.diverged)
+        self.state, groups = pack(self.programs, lanes, self.state, active)
+        limit = None if budget.max_episodes is None else jnp.int32(budget.max_episodes)
+        steps = jnp.arange(self.step, stop, dtype=jnp.int32)
+        self.state, log = self.programs.run(self.state, groups, self.data, steps, limit)
+        self.step = stop
+        was_running = book.running.copy()
+        finite, log = self._of_seeds((_finite(self.state), log))
+        book.mark_diverged(finite)
+        book.stepped(steps=np.asarray(steps), log=log)
+        due = np.flatnonzero(book.due_by_episodes() & ~book.diverged)
+        if due.size:
+            found = self._evaluate(budget.evaluation_starts_episodes, groups)
+            book.evaluated("episodes", due, found)
+        book.pending |= was_running
+        over = stop == budget.max_steps or not book.running.any()
+        if stop % budget.evaluate_every == 0 or over:
+            found = self._evaluate(budget.evaluation_starts, groups)
+            due = np.flatnonzero(book.pending & ~book.diverged)
+            book.evaluated("steps", due, found)
+            book.pending[:] = False
+            returns = np.full(lanes.seeds, -np.inf, found.return_mean.dtype)
+            returns[due] = found.return_mean[due]
+            actor = _take(self.state.agent.actor, lanes.of_seed)
+            self.best, self.best_return = _keep_best(self.best, self.best_return, actor, returns)
+
+    def result(self) -> CellResult:
+        book, state = self.book, self.state
+        return CellResult(
+            evaluations=book.evaluations,
+            episodes=book.episode_rows(),
+            best=exchange.gather(self.best),
+            reward=None if state.reward is None else self._of_seeds(state.reward.params),
+            env_steps=book.env_step,
+            demonstration_steps=np.zeros(self.lanes.seeds, np.int32)
+            if state.subset is None
+            else self._of_seeds(state.subset.length).sum(axis=1),
+            diverged=book.diverged,
+            final=self._of_seeds(state.agent.actor),
+        )
+
+    def _of_seeds(self, tree: Any) -> Any:
+        """What lies in lanes, `[lanes, ...]`, as numpy `[seeds, ...]`."""
+        index = self.lanes.of_seed
+        return jax.tree.map(lambda leaf: leaf[index], exchange.gather(tree))
+
+    def _evaluate(self, starts: int, groups: int) -> Evaluation:
+        found = self.programs.judge.on_starts(self.state.agent.actor, starts, groups)
+        return self._of_seeds(evaluator_lib.summarise(found))
+
+
+def _chunk_ends(step: int, budget: Budget) -> Iterator[int]:
+    """Where the chunks after `step` end: `CHUNK` steps at most, none across an evaluation."""
+    while step < budget.max_steps:
+        next_evaluation = (step // budget.evaluate_every + 1) * budget.evaluate_every
+        step = min(step + CHUNK, next_evaluation, budget.max_steps)
+        yield step
+
+
+def _untyped(leaf: jax.Array) -> jax.Array:
+    """Random keys as their data, which can be saved."""
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def _typed(like: jax.ShapeDtypeStruct, array: jax.Array) -> jax.Array:
+    return jax.random.wrap_key_data(array) if _is_key(like) else array
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+@jax.jit
+def _take(tree: Any, index: np.ndarray) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+@jax.jit
+def _keep_best(best: Any, best_return: jax.Array, actor: Any, returns: jax.Array):
+    better = returns > best_return
+
+    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(better.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+
+    return jax.tree.map(choose, actor, best), jnp.where(better, returns, best_return)
+
+
+@jax.jit
+def _finite(state: TrainingState) -> jax.Array:
+    reward = None if state.reward is None else state.reward.params
+    trained = (state.agent.actor, state.agent.critic, reward)
+    leaves = [
+        jnp.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1)
+        for leaf in jax.tree.leaves(trained)
+    ]
+    return jnp.stack(leaves).all(axis=0)

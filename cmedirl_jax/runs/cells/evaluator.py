@@ -1,0 +1,82 @@
+"""Noise-free rollouts of many seeds' policies, compiled once and shared by every method."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from cmedirl_jax import networks
+from cmedirl_jax.envs import Env
+from cmedirl_jax.networks import Architecture
+from cmedirl_jax.runs.cluster import exchange
+from cmedirl_jax.training import evaluation, seeds
+from cmedirl_jax.training.evaluation import Evaluation, Rollouts
+
+
+class Judge(NamedTuple):
+    """Compiled functions of policies' parameters `[seeds, ...]`, any number of seeds.
+
+    Attributes:
+        on_starts: `(actors, count, groups=None) -> Rollouts` `[seeds, count]`, from the fixed start
+            states. With `groups` only so many groups of seeds on each device; the others get zeros.
+        on_fresh_starts: `(actors, key, count) -> Rollouts` `[seeds, count]`, from random ones, the
+            same for every seed.
+        act: `(actor, observation [..., O]) -> action [..., A]` for one seed, not compiled.
+    """
+
+    on_starts: Callable[..., Rollouts]
+    on_fresh_starts: Callable[[Any, jax.Array, int], Rollouts]
+    act: Callable[[Any, jax.Array], jax.Array]
+
+
+def of_networks(
+    env: Env, architecture: Architecture, group: int, devices: list[jax.Device]
+) -> Judge:
+    """A judge of actors of one architecture."""
+    act = functools.partial(networks.policy, networks.make(env.spec, architecture))
+    return make(env, act, group, devices)
+
+
+def make(
+    env: Env,
+    act: Callable[[Any, jax.Array], jax.Array],
+    group: int,
+    devices: list[jax.Device],
+) -> Judge:
+    """A judge of the policies `act(actor, observation)`, in groups of `group` on each device."""
+    params = env.default_params
+
+    def on_starts(actors: Any, count: int, groups: int | None = None) -> Rollouts:
+        return spread(actors, env.starts(count, params), groups)
+
+    def on_fresh_starts(actors: Any, key: jax.Array, count: int) -> Rollouts:
+        reset = jax.vmap(env.reset, in_axes=(0, None))
+        return spread(actors, reset(jax.random.split(key, count), params))
+
+    def one(actor: Any, starts: Any) -> tuple[Any, Rollouts]:
+        return actor, evaluation.rollout(functools.partial(act, actor), env, params, starts)
+
+    @jax.jit
+    def spread(actors: Any, starts: Any, groups: int | None = None) -> Rollouts:
+        count = jax.tree.leaves(actors)[0].shape[0]
+        lanes = seeds.padded(count, group, len(devices))
+        filled = jax.tree.map(
+            lambda x: jnp.concatenate([x, x[:1].repeat(lanes - count, 0)]), actors
+        )
+        if groups is None:
+            groups = lanes // (group * len(devices))
+        mapped = seeds.map_devices(seeds.step_groups(one, group), devices)
+        _, found = mapped(filled, groups, starts)
+        return jax.tree.map(lambda x: x[:count], found)
+
+    return Judge(on_starts, on_fresh_starts, act)
+
+
+def summarise(rollouts: Rollouts) -> Evaluation:
+    """Each seed's statistics over its starts, `[seeds]`, on the host."""
+    return exchange.gather(_summarise(rollouts))
+
+
+_summarise = jax.jit(jax.vmap(evaluation.summarise))

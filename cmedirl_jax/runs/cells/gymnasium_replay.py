@@ -1,0 +1,58 @@
+"""The learned policies replayed in Gymnasium's own environment, against the pure-JAX one."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax.envs import Env
+from cmedirl_jax.runs.cells.evaluator import Judge
+from cmedirl_jax.runs.cluster import exchange
+
+STARTS = 3
+"""Start states per policy: both ends and the middle of the start interval."""
+
+
+class Replay(NamedTuple):
+    """Returns of the same episodes in the two environments, `[seeds, STARTS]` each."""
+
+    gymnasium_return: np.ndarray
+    jax_return: np.ndarray
+
+
+def replay(judge: Judge, actors: Any, env: Env) -> Replay:
+    """Run each seed's policy `[seeds, ...]` from the same starts in both environments."""
+    jax_return = exchange.gather(judge.on_starts(actors, STARTS).episode_return)
+    act = jax.jit(jax.vmap(judge.act))
+    return Replay(_run(lambda observations: act(actors, observations), actors, env), jax_return)
+
+
+def _run(act: Callable[[jax.Array], jax.Array], actors: Any, env: Env) -> np.ndarray:
+    """Step all seeds' Gymnasium environments side by side; returns `[seeds, STARTS]`."""
+    count = jax.tree.leaves(actors)[0].shape[0]
+    _, observations = env.starts(STARTS, env.default_params)
+    environments = [[gymnasium.make(env.spec.id) for _ in range(STARTS)] for _ in range(count)]
+    current = np.broadcast_to(observations, (count, *observations.shape)).copy()
+    for row in environments:
+        for environment, observation in zip(row, np.asarray(observations), strict=True):
+            environment.reset(seed=0)
+            # Gymnasium has no reset to a given state; for classic control it is the attribute.
+            environment.unwrapped.state = observation.copy()  # type: ignore[attr-defined]
+    returns = np.zeros((count, STARTS))
+    running = np.ones((count, STARTS), bool)
+    while running.any():
+        actions = np.asarray(act(jnp.asarray(current)))
+        for seed, start in zip(*np.nonzero(running), strict=True):
+            observation, reward, terminated, truncated, _ = environments[seed][start].step(
+                actions[seed, start]
+            )
+            current[seed, start] = observation
+            returns[seed, start] += float(reward)
+            running[seed, start] = not (terminated or truncated)
+    for row in environments:
+        for environment in row:
+            environment.close()
+    return returns

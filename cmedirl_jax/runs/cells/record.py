@@ -1,0 +1,229 @@
+"""The host's record of a cell in training: who runs, what was evaluated, which episodes ended."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from cmedirl_jax.training import Log
+from cmedirl_jax.training.evaluation import Evaluation
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """How long each seed trains, and when it is evaluated."""
+
+    max_steps: int
+    max_episodes: int | None
+    evaluate_every: int
+    evaluation_starts: int
+    evaluate_every_episodes: int | None = None
+    evaluation_starts_episodes: int = 100
+
+
+class Means(NamedTuple):
+    """Means over the updates since the last evaluation by steps; NaN where there was none.
+
+    Attributes:
+        q_mean: Q(s, a) over the agent's minibatches.
+        critic_loss: mean squared temporal-difference error.
+        demonstration_reward: r_D over the reward learner's demonstrations.
+        background_reward: r_D over its background.
+        effective_sample_size: of its samples' weights.
+    """
+
+    q_mean: np.ndarray
+    critic_loss: np.ndarray
+    demonstration_reward: np.ndarray
+    background_reward: np.ndarray
+    effective_sample_size: np.ndarray
+
+
+OF_AGENT = Means._fields[:2]
+OF_REWARD = Means._fields[2:]
+
+
+class EvaluationRows(NamedTuple):
+    """One evaluation of the seeds that were due, leaves `[seeds due]` (numpy).
+
+    Attributes:
+        protocol: "steps", or "episodes" for those made every so many episodes.
+        seed: which seeds.
+        env_step: steps each had learned from.
+        episode: episodes each had finished.
+        evaluation: what was found.
+        means: diagnostics of the updates before it.
+    """
+
+    protocol: str
+    seed: np.ndarray
+    env_step: np.ndarray
+    episode: np.ndarray
+    evaluation: Evaluation
+    means: Means
+
+
+class EpisodeRows(NamedTuple):
+    """Finished episodes, leaves `[episodes]` (numpy); `env_step` is the step each ended at."""
+
+    seed: np.ndarray
+    episode: np.ndarray
+    env_step: np.ndarray
+    episode_return: np.ndarray
+    length: np.ndarray
+    terminated: np.ndarray
+
+
+_EVALUATIONS = EvaluationRows(
+    *EvaluationRows._fields[:4], Evaluation(*Evaluation._fields), Means(*Means._fields)
+)
+"""The name of every column in `Book.record`."""
+
+_SEEDS = ("env_step", "episode", "running", "pending", "diverged", "latest", "_episode_mark")
+
+
+class Book:
+    """The record of `seeds_count` seeds; its arrays are `[seeds]`.
+
+    Attributes:
+        env_step: steps each seed has learned from.
+        episode: episodes each has finished.
+        running: neither out of episodes nor diverged.
+        pending: has learned since its last evaluation by steps.
+        diverged: stopped because a parameter was no longer finite.
+        latest: mean return at the last evaluation by steps.
+        evaluations: all of them, in the order they were made.
+    """
+
+    def __init__(self, seeds_count: int, budget: Budget):
+        self.budget = budget
+        self.env_step = np.zeros(seeds_count, np.int32)
+        self.episode = np.zeros(seeds_count, np.int32)
+        self.running = np.ones(seeds_count, bool)
+        self.pending = np.zeros(seeds_count, bool)
+        self.diverged = np.zeros(seeds_count, bool)
+        self.latest = np.full(seeds_count, -np.inf)
+        self.evaluations: list[EvaluationRows] = []
+        self._episodes: list[EpisodeRows] = []
+        self._episode_mark = np.zeros(seeds_count, np.int32)
+        self._sums = Means(*(np.zeros(seeds_count) for _ in Means._fields))
+        self._updates = Means(*(np.zeros(seeds_count) for _ in Means._fields))
+
+    def stepped(self, steps: np.ndarray, log: Log) -> None:
+        """Record a chunk's episodes and update statistics."""
+        count = self.env_step.size
+        log = jax.tree.map(lambda leaf: leaf[:count], log)
+        done = log.done & self.running[:, None]
+        # Rows of np.nonzero are in order of seed, then of step.
+        seed, at = np.nonzero(done)
+        number = self.episode[:, None] + np.cumsum(done, axis=1)
+        self._episodes.append(
+            EpisodeRows(
+                seed=seed,
+                episode=number[seed, at],
+                env_step=steps[at] + 1,
+                episode_return=log.episode_return[seed, at],
+                length=log.episode_length[seed, at],
+                terminated=log.terminated[seed, at],
+            )
+        )
+        self.episode = self.episode + done.sum(axis=1, dtype=np.int32)
+        end = np.full(count, steps[-1] + 1, np.int32)
+        if self.budget.max_episodes is not None:
+            finished = self.running & (self.episode >= self.budget.max_episodes)
+            last = done.shape[1] - 1 - np.argmax(done[:, ::-1], axis=1)
+            end = np.where(finished, steps[last] + 1, end)
+        else:
+            finished = np.zeros(count, bool)
+        active = (steps[None, :] < end[:, None]) & self.running[:, None]
+        for source, names, updated in (
+            (log, OF_AGENT, active & log.learned),
+            (log.reward, OF_REWARD, active & log.reward_learned),
+        ):
+            for name in names if source is not None else ():
+                found = np.where(updated, getattr(source, name), 0.0)
+                getattr(self._sums, name)[:] += found.sum(axis=1)
+                getattr(self._updates, name)[:] += updated.sum(axis=1)
+        self.env_step = np.where(self.running, end, self.env_step)
+        self.running &= ~finished
+
+    def mark_diverged(self, finite: np.ndarray) -> None:
+        """Stop the running seeds whose parameters are no longer finite."""
+        self.diverged |= self.running & ~finite
+        self.running &= finite
+
+    def due_by_episodes(self) -> np.ndarray:
+        """Which seeds have passed another multiple of `evaluate_every_episodes`."""
+        every = self.budget.evaluate_every_episodes
+        if every is None:
+            return np.zeros(self.episode.size, bool)
+        mark = self.episode // every
+        due = mark > self._episode_mark
+        self._episode_mark = mark
+        return due
+
+    def evaluated(self, protocol: str, due: np.ndarray, found: Evaluation) -> None:
+        """Record an evaluation of the seeds `due`."""
+        if not due.size:
+            return
+        found = jax.tree.map(lambda leaf: np.asarray(leaf)[due], found)
+        with np.errstate(invalid="ignore"):
+            means = jax.tree.map(lambda total, n: total[due] / n[due], self._sums, self._updates)
+        self.evaluations.append(
+            EvaluationRows(protocol, due, self.env_step[due], self.episode[due], found, means)
+        )
+        if protocol == "steps":
+            self.latest[due] = found.return_mean
+            for totals in (*self._sums, *self._updates):
+                totals[due] = 0.0
+
+    def solved_fraction(self, threshold: float) -> float:
+        """Share of all seeds whose latest evaluation reaches the threshold."""
+        return float(np.mean(self.latest >= threshold))
+
+    def episode_rows(self) -> EpisodeRows:
+        """All episodes recorded."""
+        if not self._episodes:
+            return EpisodeRows(*(np.zeros(0, np.int32) for _ in EpisodeRows._fields))
+        return EpisodeRows(
+            *(np.concatenate(column) for column in zip(*self._episodes, strict=True))
+        )
+
+    def record(self) -> dict[str, np.ndarray]:
+        """All of it as arrays by name, for `of_record`; copies, which the book does not change."""
+        # Columns end to end, and how many rows each evaluation has; its protocol as a column too.
+        rows = [
+            found._replace(protocol=np.repeat(found.protocol, len(found.seed)))
+            for found in self.evaluations
+        ]
+        evaluations = jax.tree.map(lambda *columns: np.concatenate(columns), *rows)
+        named = zip(jax.tree.leaves(_EVALUATIONS), jax.tree.leaves(evaluations), strict=True)
+        record = {
+            **{name: getattr(self, name) for name in _SEEDS},
+            **{f"sums.{name}": column for name, column in self._sums._asdict().items()},
+            **{f"updates.{name}": column for name, column in self._updates._asdict().items()},
+            "evaluations": np.array([len(found.seed) for found in self.evaluations]),
+            **{f"evaluations.{name}": column for name, column in named},
+            **{f"episodes.{name}": x for name, x in self.episode_rows()._asdict().items()},
+        }
+        return {name: np.array(column) for name, column in record.items()}
+
+    @classmethod
+    def of_record(cls, record: dict[str, np.ndarray], budget: Budget) -> "Book":
+        """The book that gave this `record`, to be written on."""
+        book = cls(record["running"].size, budget)
+        for name in _SEEDS:
+            setattr(book, name, record[name])
+        book._sums, book._updates = (
+            Means(*(record[f"{kind}.{name}"] for name in Means._fields))
+            for kind in ("sums", "updates")
+        )
+        ends = np.cumsum(record["evaluations"])
+        for start, stop in zip(ends - record["evaluations"], ends, strict=True):
+            rows = jax.tree.map(
+                lambda name, of=slice(start, stop): record[f"evaluations.{name}"][of], _EVALUATIONS
+            )
+            book.evaluations.append(rows._replace(protocol=str(rows.protocol[0])))
+        book._episodes = [EpisodeRows(*(record[f"episodes.{x}"] for x in EpisodeRows._fields))]
+        return book

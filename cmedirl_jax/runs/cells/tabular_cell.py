@@ -1,0 +1,175 @@
+"""One cell of the grid whose method never acts: maximum-entropy IRL on a grid, all seeds."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax.agents.hot_start import HotStartData
+from cmedirl_jax.data import demonstrations
+from cmedirl_jax.envs import Env
+from cmedirl_jax.runs.cells import evaluator as evaluator_lib
+from cmedirl_jax.runs.cells.cell import CellResult
+from cmedirl_jax.runs.cells.evaluator import Judge
+from cmedirl_jax.runs.cells.record import EpisodeRows, EvaluationRows, Means
+from cmedirl_jax.runs.cluster import exchange
+from cmedirl_jax.runs.storage.checkpoints import Keeper
+from cmedirl_jax.tabular import discretise, imitation
+from cmedirl_jax.tabular.discretise import FiniteMDP
+from cmedirl_jax.training import seeds
+from cmedirl_jax.training.evaluation import Evaluation
+from cmedirl_jax.training.methods import Method, Settings
+
+
+class Fitted(NamedTuple):
+    """What each seed learned.
+
+    Attributes:
+        reward: `[S, A]`.
+        log_probabilities: `[S, A]`, of its soft-optimal policy.
+        demonstration_steps: `[]` int32, environment steps in the seed's own demonstrations.
+    """
+
+    reward: Any
+    log_probabilities: Any
+    demonstration_steps: Any
+
+
+class Programs(NamedTuple):
+    """The compiled functions of a method.
+
+    Attributes:
+        fit: `(keys [lanes], mdp, data, n_demonstrations) -> Fitted` `[lanes, ...]`.
+        mdp: the environment on the grid.
+        judge: of greedy policies, by tables of preferences `[seeds, S, A]`.
+        soft_judge: of the soft policies, by tables of log-probabilities `[seeds, S, A]`.
+        devices: that share the seeds.
+    """
+
+    fit: Callable[..., Fitted]
+    mdp: FiniteMDP
+    judge: Judge
+    soft_judge: Judge
+    devices: int
+
+
+def compile_method(
+    env: Env,
+    method: Method,
+    settings: Settings,
+    *,
+    devices: list[jax.Device],
+    subset_size: int | None,
+) -> Programs:
+    """Jit a method's fit and its judges. Compiles at first use."""
+    kind = method.tabular
+    assert kind is not None
+    mdp = jax.jit(lambda: imitation.discretised(env, settings.tabular))()
+
+    def of_seed(key: jax.Array, mdp: FiniteMDP, data: HotStartData, n_demonstrations: int):
+        subset_key, fit_key = jax.random.split(key)
+        subset = demonstrations.subset(subset_key, data.episodes, n_demonstrations, subset_size)
+        found = imitation.fit(
+            fit_key, mdp, env.spec, data, subset, kind=kind, settings=settings.tabular
+        )
+        steps = jnp.sum(subset.length)
+        return Fitted(found.reward, found.policy.log_probabilities, steps)
+
+    # One at a time: each seed's fixed points take as many iterations as they need.
+    fit = seeds.map_devices(seeds.map_groups(of_seed, 1), devices)
+
+    def greedy(table: jax.Array, observation: jax.Array) -> jax.Array:
+        return discretise.greedy(mdp, table)(observation)
+
+    def soft(table: jax.Array, observation: jax.Array) -> jax.Array:
+        return discretise.look_up(mdp, table, observation)
+
+    return Programs(
+        fit=jax.jit(fit),
+        mdp=mdp,
+        judge=evaluator_lib.make(env, greedy, 1, devices),
+        soft_judge=evaluator_lib.make(discretise.sampled(mdp, env), soft, 1, devices),
+        devices=len(devices),
+    )
+
+
+def train(
+    programs: Programs,
+    key: jax.Array,
+    data: HotStartData,
+    n_demos: int,
+    *,
+    seeds_count: int,
+    evaluation_starts: int,
+    keeper: Keeper | None = None,
+) -> CellResult:
+    """Fit every seed and evaluate its greedy policy, and as protocol "soft" its soft one, once.
+
+    Args:
+        programs: of the cell's method.
+        key: the cell's randomness.
+        data: the demonstrations.
+        n_demos: how many of them each seed draws.
+        seeds_count: how many seeds.
+        evaluation_starts: start states of the evaluations.
+        keeper: saves the seeds that are fitted, and has what was saved of them before.
+
+    Raises:
+        Interrupted: by the keeper.
+    """
+    # A seed takes seconds: each device fits one between looks from the host.
+    keys = seeds.keys(key, seeds_count + programs.devices)
+    parts: list[Fitted] = []
+
+    def fit(keys: jax.Array) -> Fitted:
+        return programs.fit(keys, programs.mdp, data, n_demos)
+
+    def abstract(record: dict[str, np.ndarray]) -> Fitted:
+        one = jax.eval_shape(fit, keys[: programs.devices])
+        return jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct((int(record["fitted"]), *leaf.shape[1:]), leaf.dtype),
+            one,
+        )
+
+    def take() -> tuple[Fitted, dict[str, np.ndarray]]:
+        fitted = _joined(parts)
+        return fitted, {"fitted": np.array(len(fitted.reward))}
+
+    fitted = 0
+    if keeper is not None and (saved := keeper.load(abstract)) is not None:
+        fitted = saved.step
+        parts.append(saved.state)
+    for first in range(fitted, seeds_count, programs.devices):
+        parts.append(exchange.gather(fit(keys[first : first + programs.devices])))
+        if keeper is not None:
+            keeper.visit(first + programs.devices, take)
+    found = jax.tree.map(lambda leaf: leaf[:seeds_count], _joined(parts))
+    table = found.log_probabilities
+    every = np.arange(seeds_count)
+    zeros = np.zeros(seeds_count, np.int32)
+    unknown = Means(*(np.full(seeds_count, np.nan) for _ in Means._fields))
+
+    def rows(protocol: str, found: Evaluation) -> EvaluationRows:
+        return EvaluationRows(protocol, every, zeros, zeros, found, unknown)
+
+    greedy, soft = (
+        evaluator_lib.summarise(judge.on_starts(table, evaluation_starts))
+        for judge in (programs.judge, programs.soft_judge)
+    )
+    nothing = np.zeros(0, np.int32)
+    return CellResult(
+        evaluations=[rows("steps", greedy), rows("soft", soft)],
+        episodes=EpisodeRows(*(nothing for _ in EpisodeRows._fields)),
+        best=table,
+        reward=found.reward,
+        env_steps=zeros,
+        demonstration_steps=found.demonstration_steps,
+        diverged=~np.isfinite(found.reward).all(axis=(1, 2)),
+        final=table,
+    )
+
+
+def _joined(parts: list[Fitted]) -> Fitted:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

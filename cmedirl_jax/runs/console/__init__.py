@@ -1,0 +1,1 @@
+"""The terminal: progress, signals, standard streams, and the compilation cache."""

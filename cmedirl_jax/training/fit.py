@@ -1,0 +1,107 @@
+"""Training many seeds and evaluating them as they go, in one call."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from cmedirl_jax.agents import hot_start
+from cmedirl_jax.data import demonstrations as demonstrations_lib
+from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.envs import Env
+from cmedirl_jax.training import evaluation, methods
+from cmedirl_jax.training import seeds as seeds_lib
+from cmedirl_jax.training.evaluation import Evaluation
+from cmedirl_jax.training.initialise import TrainingState
+from cmedirl_jax.training.methods import Method, Settings
+from cmedirl_jax.training.step import Log, make
+
+
+class Result(NamedTuple):
+    """What `fit` returns, every leaf with a leading axis of seeds.
+
+    Attributes:
+        states: the final training states `[seeds, ...]`.
+        evaluations: `[seeds, 1 + steps // evaluate_every]`, the first before any step.
+        episodes: the step-wise log `[seeds, steps]`.
+    """
+
+    states: TrainingState
+    evaluations: Evaluation
+    episodes: Log
+
+
+def fit(
+    key: jax.Array,
+    env: Env,
+    method: Method | str,
+    demonstrations: Demonstrations | None = None,
+    *,
+    seeds: int,
+    steps: int,
+    n_demonstrations: int | None = None,
+    settings: Settings | None = None,
+    evaluate_every: int = 250,
+    evaluation_starts: int = 10,
+) -> Result:
+    """Train `seeds` independent learners and evaluate them as they go. Jittable; jits nothing.
+
+    Args:
+        key: seed i learns from `fold_in(key, i)`.
+        env: the environment.
+        method: a `Method`, or the name of one of `METHODS`.
+        demonstrations: the pool, for methods that use one.
+        seeds: how many learners.
+        steps: environment steps of each; a multiple of `evaluate_every`.
+        n_demonstrations: episodes that each learner draws from the pool; default all.
+        settings: every other choice.
+        evaluate_every: steps between evaluations.
+        evaluation_starts: start states per evaluation.
+
+    Raises:
+        ValueError: for an unknown method, missing demonstrations or some that are not valid for
+            the environment, sizes that are not positive, `steps` that are no multiple of
+            `evaluate_every`, or what `make` refuses.
+    """
+    if isinstance(method, str):
+        if method not in methods.METHODS:
+            raise ValueError(f"unknown method {method!r}; there are: {', '.join(methods.METHODS)}")
+        method = methods.METHODS[method]
+    if min(seeds, steps, evaluate_every, evaluation_starts) < 1:
+        raise ValueError("seeds, steps, evaluate_every and evaluation_starts must be positive")
+    if steps % evaluate_every:
+        raise ValueError(f"steps ({steps}) must be a multiple of evaluate_every ({evaluate_every})")
+    settings = settings or Settings()
+    data, n = None, 0
+    if demonstrations is not None and method.uses_demonstrations:
+        demonstrations_lib.validate(demonstrations, env.spec)
+        agent = settings.agent
+        data = hot_start.data(demonstrations, agent.discount, agent.reward_scale)
+        n = len(data.episodes.start) if n_demonstrations is None else n_demonstrations
+    trainer = make(env, method, settings, capacity=steps)
+
+    def evaluate(state: TrainingState) -> Evaluation:
+        return evaluation.evaluate(
+            lambda observation: trainer.act(state.agent.actor, observation),
+            env,
+            env.default_params,
+            evaluation_starts,
+        )
+
+    def learn(key: jax.Array) -> Result:
+        state = trainer.init(key, data, n)
+        first = evaluate(state)
+
+        def chunk(state: TrainingState, steps: jax.Array):
+            state, log = trainer.run(state, data, steps)
+            return state, (evaluate(state), log)
+
+        chunks = jnp.arange(steps).reshape(-1, evaluate_every)
+        state, (later, log) = jax.lax.scan(chunk, state, chunks)
+        evaluations = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), first, later)
+        return Result(state, evaluations, jax.tree.map(lambda x: x.reshape(steps), log))
+
+    group = seeds_lib.group_size(seeds, hidden=settings.architecture.hidden)
+    keys = seeds_lib.keys(key, seeds_lib.padded(seeds, group))
+    result = seeds_lib.map_groups(learn, group)(keys)
+    return jax.tree.map(lambda x: x[:seeds], result)

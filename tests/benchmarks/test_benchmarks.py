@@ -1,0 +1,338 @@
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks import (
+    checkpoint_cost,
+    measuring,
+    naive,
+    ours,
+    peers,
+    plots,
+    scaling,
+    seeds_per_second,
+)
+from benchmarks.measuring import Record
+from benchmarks.peers import PEERS
+from benchmarks.serving import Worker
+from benchmarks.workload import Workload
+from cmedirl_jax.runs.cells import compiled as compiled_lib
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.training.methods import PAPER_METHODS
+from tests.support import pools
+
+TINY = {"seeds": 3, "hidden": (4, 4), "batch": 4}
+DESIGNED = {
+    *("variant", "method", "seeds", "width", "batch", "layer_norm", "devices"),
+    *("learning_steps_per_second", "seeds_per_second", "compile_seconds", "peak_memory_bytes"),
+}
+LOOP = """
+import sys, time
+from benchmarks.serving import serve
+print("said by a library")
+serve(lambda steps: time.sleep(steps / 1000), int(sys.argv[-1]), lambda: {"answer": 42})
+"""
+
+
+@pytest.fixture
+def worker():
+    made = Worker([sys.executable, "-c", LOOP, "20"], measuring.one_core())
+    yield made
+    made.stop()
+
+
+def test_a_worker_times_its_loop_and_nothing_else(worker):
+    assert worker.facts["answer"] == 42
+    assert worker.facts["first_call_seconds"] >= 0.02
+    for steps in (10, 50):
+        assert steps / 1000 <= worker.seconds(steps) < steps / 1000 + 0.5
+    if worker.peak_memory_bytes is not None:
+        assert 1e6 < worker.peak_memory_bytes < 1e9
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="processes cannot be pinned here")
+def test_a_worker_runs_on_its_core_alone():
+    code = LOOP.replace('"answer": 42', '"cores": sorted(__import__("os").sched_getaffinity(0))')
+    (core,) = measuring.one_core()
+    worker = Worker([sys.executable, "-c", code, "1"], [core])
+    assert worker.facts["cores"] == [core]
+    worker.stop()
+
+
+def test_a_worker_that_fails_says_why():
+    broken = Worker([sys.executable, "-c", "raise SystemExit('no such thing')"], None)
+    with pytest.raises(RuntimeError, match="no such thing"):
+        broken.facts  # noqa: B018
+    broken.stop()
+
+
+class FakeWorker:
+    """Takes a second a step, and twice that from its second call on."""
+
+    def __init__(self, name, calls, seconds=1.0):
+        self.name, self.calls, self.each = name, calls, seconds
+        self.facts = {"compile_seconds": 3.0, "platform": "cpu"}
+        self.peak_memory_bytes = 10**9
+        self.stopped = False
+
+    def seconds(self, steps):
+        self.calls.append(self.name)
+        return steps * self.each * (1 + (self.calls.count(self.name) > 1))
+
+    def wait(self):
+        assert not self.stopped
+
+    def stop(self):
+        self.stopped = True
+
+
+def test_workers_are_timed_in_turn():
+    calls = []
+    workers = [(FakeWorker("a", calls), 10, 100.0), (FakeWorker("b", calls, 0.5), 20, 40.0)]
+    assert measuring.in_turn(workers, 3) == [[10.0, 5.0, 5.0], [4.0, 2.0, 2.0]]
+    assert calls == ["a", "b"] * 3
+
+
+rates = st.lists(st.floats(1e-3, 1e6), min_size=1, max_size=9)
+
+
+@given(rates, st.floats(1e-3, 1e3), st.randoms())
+def test_a_ratio_does_not_notice_a_machine_whose_speed_drifts(speeds, ratio, random):
+    below = [speed * random.uniform(0.5, 2.0) for speed in speeds]
+    found = measuring.compare("suite", "name", [ratio * rate for rate in below], below)
+    np.testing.assert_allclose([found.median, found.low, found.high], ratio, rtol=1e-6)
+
+
+@pytest.mark.parametrize("variant", [ours, naive])
+@pytest.mark.parametrize("method", ["ddpg", "hs-me-ddpg"])
+def test_a_workload_advances_all_its_seeds(variant, method):
+    advance = variant.start(Workload(method=method, n_demos=2, **TINY), pools.scripted())
+    advance(5)
+    advance(5)
+
+
+def test_every_timed_step_learns(monkeypatch):
+    logs = []
+    compile_method = compiled_lib.compile_method
+
+    def compile_and_listen(*args, **kwargs):
+        compiled = compile_method(*args, **kwargs)
+
+        def run(*args):
+            state, log = compiled.run(*args)
+            logs.append(log)
+            return state, log
+
+        return compiled._replace(run=run)
+
+    monkeypatch.setattr(compiled_lib, "compile_method", compile_and_listen)
+    ours.start(Workload(**TINY), pools.scripted())(5)
+    assert np.all(logs[0].learned)
+    assert np.all(np.asarray(logs[0].critic_loss)[:, 1:] > 0.0)
+
+
+def test_a_workload_can_leave_out_seeds_that_have_ended():
+    advance = ours.start(Workload(running=0.34, group=1, **TINY), pools.scripted())
+    advance(5)
+
+
+@pytest.fixture
+def fake_start(monkeypatch):
+    """Workloads that run in no process; returns those that were asked for."""
+    started = []
+
+    def start(workload, steps, **environment):
+        started.append((workload, environment))
+        naive = workload.variant == "naive"
+        return FakeWorker(len(started), [], (2.0 if naive else 1.0) * workload.seeds / 100)
+
+    monkeypatch.setattr(measuring, "start", start)
+    monkeypatch.setattr(measuring, "cores", lambda: 2)
+    return started
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_seeds_per_second_writes_what_the_design_lists(
+    fake_start, monkeypatch, tmp_path, quick, capsys
+):
+    path = tmp_path / "new" / "speed.json"
+    # It draws after each suite; here the last figure alone, of all that was measured.
+    drawn, draw = [], plots.growth
+    monkeypatch.setattr(plots, "growth", lambda *args: drawn.append(args))
+    options = seeds_per_second.Options(quick=quick, json=path)
+    assert seeds_per_second.main(options) == 0
+    written = json.loads(path.read_text())
+    assert {"machine", "versions", "records", "command", "date"} <= written.keys()
+    assert all(record.keys() >= DESIGNED for record in written["records"])
+    draw(*drawn[-1])
+    assert path.with_suffix(".png").stat().st_size
+    name = "ours / naive" if quick else "ours / naive, ddpg, 100 seeds"
+    (ratio,) = (entry for entry in written["comparisons"] if entry["name"] == name)
+    assert ratio["median"] == ratio["low"] == ratio["high"] == 2.0
+    assert f"{name}: 2.00" in capsys.readouterr().out
+    measured = {(record["method"], record["seeds"]) for record in written["records"]}
+    if quick:
+        assert measured == {("ddpg", 100)}
+    else:
+        methods, sizes = PAPER_METHODS, seeds_per_second.SEEDS
+        assert measured >= {(method, seeds) for method in methods for seeds in sizes}
+        assert len(written["compilation"]) == 2 * len(methods)
+
+
+def test_only_the_suites_asked_for_are_measured(fake_start, tmp_path):
+    path = tmp_path / "speed.json"
+    seeds_per_second.main(seeds_per_second.Options(suites=("scale",), json=path))
+    assert [workload.seeds for workload, _ in fake_start] == [100, 1000]
+    assert json.loads(path.read_text())["compilation"] == []
+
+
+def test_only_the_methods_asked_for_are_measured(fake_start):
+    options = seeds_per_second.Options(suites=("seeds", "method"), methods=("me-ddpg",))
+    assert seeds_per_second.main(options) == 0
+    seeds_suite = [workload.method for workload, _ in fake_start[: 2 * len(seeds_per_second.SEEDS)]]
+    assert set(seeds_suite) == {"me-ddpg"}
+    assert [workload.method for workload, _ in fake_start[-3:]] == ["ddpg", "me-ddpg", "ddpg"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"suites": ("sizes",)}, "--suites: unknown suite 'sizes'; there are seeds, "),
+        ({"methods": ("sac",)}, "--methods: unknown method 'sac'; there are ddpg, "),
+    ],
+)
+def test_unknown_suites_and_methods_are_refused(fake_start, capsys, options, message):
+    assert seeds_per_second.main(seeds_per_second.Options(**options)) == 2
+    assert capsys.readouterr().err.startswith(f"seeds_per_second: {message}")
+
+
+def test_a_record_is_summed_up_by_its_median():
+    record = Record(Workload(), [3.0, 12_000.0, 24_000.0], 5.0, None, "cpu").fields()
+    assert record["learning_steps_per_second"] == 12_000.0
+    assert record["seeds_per_second"] == 1.0
+    assert record["learning_steps_per_second_best"] == 24_000.0
+    assert record["learning_steps_per_second_worst"] == 3.0
+
+
+def test_a_peer_that_cannot_be_installed_is_named(fake_start, monkeypatch, tmp_path, capsys):
+    def environment(name, requirements, folder):
+        if name == "rejax_td3":
+            raise RuntimeError("there is no such version")
+        return Path("python")
+
+    workers = []
+
+    def make(command, cores):
+        workers.append(FakeWorker(command[2], [], 0.01))
+        return workers[-1]
+
+    monkeypatch.setattr(peers, "environment", environment)
+    monkeypatch.setattr(peers, "versions", lambda python: {"jax": "1"})
+    monkeypatch.setattr(peers, "Worker", make)
+    path = tmp_path / "peers.json"
+    assert peers.main(peers.Options(environments=tmp_path, json=path)) == 0
+    entries = {entry["module"]: entry for entry in json.loads(path.read_text())["peers"]}
+    assert entries.keys() == {peer.module for peer in PEERS}
+    assert entries["rejax_td3"]["error"] == "there is no such version"
+    # Ours takes a hundred steps a second, a peer of one seed a hundredth of a second for each.
+    assert entries["sb3_ddpg"]["ratio"]["median"] == pytest.approx(1.0)
+    printed = capsys.readouterr().out
+    assert "not installed" in printed
+    assert "there is no such version" in printed
+    assert all(worker.stopped for worker in workers)
+
+
+def test_a_peers_environment_is_made_once_and_again_for_other_requirements(tmp_path, monkeypatch):
+    commands = []
+
+    def run(command, **_):
+        commands.append(list(map(str, command)))
+        if "venv" in commands[-1]:
+            Path(commands[-1][-1]).mkdir(exist_ok=True)
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr(peers.subprocess, "run", run)
+    python = peers.environment("peer", ("this", "that==1"), tmp_path)
+    assert python.is_relative_to(tmp_path / "peer")
+    assert [command[2] for command in commands] == ["venv", "pip"]
+    assert commands[1][-2:] == ["this", "that==1"]
+    assert peers.environment("peer", ("this", "that==1"), tmp_path) == python
+    assert len(commands) == 2
+    peers.environment("peer", ("other",), tmp_path)
+    assert len(commands) == 4
+
+
+def test_an_installation_that_fails_is_not_taken_for_done(tmp_path, monkeypatch):
+    def run(command, **_):
+        if "venv" in command:
+            Path(command[-1]).mkdir()
+        return subprocess.CompletedProcess(command, int("pip" in command), "", "no matching thing")
+
+    monkeypatch.setattr(peers.subprocess, "run", run)
+    with pytest.raises(RuntimeError, match="no matching thing"):
+        peers.environment("peer", ("this",), tmp_path)
+    assert not (tmp_path / "peer" / "requirements.txt").exists()
+
+
+@pytest.mark.parametrize("peer", PEERS, ids=lambda peer: peer.module)
+def test_every_peer_has_its_loop(peer):
+    loops = Path(peers.__file__).with_name("peer_loops")
+    assert (loops / f"{peer.module}.py").exists()
+    assert "serve_from_command_line(" in (loops / f"{peer.module}.py").read_text()
+
+
+def test_workloads_are_plain_data():
+    workload = Workload(method="me-ddpg", hidden=(400, 300))
+    options = json.loads(json.dumps(dataclasses.asdict(workload)))
+    assert Workload(**{**options, "hidden": tuple(options["hidden"])}) == workload
+
+
+def test_a_process_of_the_scaling_benchmark_times_its_turns():
+    job = {"method": "ddpg", "seeds_count": 1, "devices": 1, "coordinator": "", "processes": 1}
+    worker = scaling.start(job | {"index": 0})
+    try:
+        times = scaling.turn([worker])
+    finally:
+        worker.kill()
+        worker.communicate()
+    assert times["chunk_s"] > 0.0
+    assert times["gather_bytes"] == 5_000
+
+
+@pytest.fixture
+def fake_training(monkeypatch):
+    """A cell of ten chunks, a hundredth of a second each."""
+
+    weight = np.random.default_rng(0).random(1_000)
+
+    def train(*_, keeper, **__):
+        for step in range(10):
+            time.sleep(0.01)
+            if keeper is not None:
+                keeper.visit(step, lambda: ({"weight": weight}, {"step": np.ones(1)}))
+
+    monkeypatch.setattr(checkpoint_cost.cells, "train", train)
+
+
+def test_checkpoints_are_counted_and_their_cost_is_of_the_time_without(fake_training):
+    options = checkpoint_cost.Options(every=0.03, rounds=3)
+    found = checkpoint_cost.measure(options, compiled=None)
+    assert 3 <= found["checkpoints"] <= 3 * 4
+    assert 8_000 <= found["checkpoint_bytes"] < 20_000
+    assert found["cost_low"] <= found["cost"] <= found["cost_high"]
+    assert found["cost_by_default"] == pytest.approx(found["cost"] * 0.03 / 60)
+    assert found["blocked_seconds"] > 0.0
+
+
+def test_a_run_too_short_for_a_checkpoint_says_so(fake_training):
+    with pytest.raises(UserError, match=r"--every: none was due .* ask for more --steps"):
+        checkpoint_cost.measure(checkpoint_cost.Options(every=60.0), compiled=None)

@@ -1,0 +1,349 @@
+"""Runs that are killed, stopped, started twice or out of disk, as real processes."""
+
+import contextlib
+import glob
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import chex
+import jax
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+from cmedirl_jax.data import demonstrations
+from cmedirl_jax.io import checkpoint
+from cmedirl_jax.runs.storage import sealing
+from experiments import conclusion, run_grid
+from tests.support import ROOT, pools
+
+# Orbax says so on every load that names no shardings.
+pytestmark = pytest.mark.filterwarnings("ignore:Sharding info not provided:UserWarning")
+
+STEPS = 1500
+RUN = (
+    *("--methods", "hs-me-ddpg", "--n-demos", "1", "2", "--seeds", "4"),
+    *("--max-steps", str(STEPS), "--architecture.hidden", "8", "--hot-start.steps", "20"),
+    *("--devices", "1", "--checkpoint-every", "0"),
+)
+"""Two cells of the same program, six chunks each, every one of which is saved."""
+CONTINUE = "start the same command again to go on\n"
+ISOLATED = ("unshare", "--map-root-user", "--mount")
+LEARNED = ("policies", "rewards")
+LIMIT = 300.0
+"""Seconds after which a process that should have ended is one that hangs."""
+
+
+class Runs:
+    """The same run in any folder, any number of times."""
+
+    def __init__(self, folder, environment):
+        self.folder, self.environment = folder, environment
+        self.demos = folder / "demos.npz"
+        demonstrations.save(self.demos, pools.scripted(3))
+
+    def command(self, out):
+        program = (sys.executable, "-m", "experiments.run_grid")
+        return (*program, *RUN, "--demos", str(self.demos), "--out", str(out))
+
+    def start(self, out, *options, prefix=(), **environment):
+        return subprocess.Popen(
+            (*prefix, *self.command(out), *options),
+            cwd=ROOT,
+            env=self.environment | environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def finish(self, out, *options):
+        """Run until the end; returns what was printed."""
+        process = self.start(out, *options)
+        output, errors = process.communicate(timeout=LIMIT)
+        assert process.returncode == 0, errors
+        assert not errors
+        return output
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory, compiled):
+    return Runs(tmp_path_factory.mktemp("runs"), os.environ | compiled)
+
+
+@pytest.fixture(scope="module")
+def whole(runs):
+    """The folder of a run that nothing befell."""
+    runs.finish(runs.folder / "whole")
+    return runs.folder / "whole"
+
+
+def assert_same_run(folder, whole):
+    for name in sealing.TABLES:
+        assert_frame_equal(
+            pl.read_parquet(folder / f"{name}.parquet"), pl.read_parquet(whole / f"{name}.parquet")
+        )
+    assert (folder / "summary.csv").read_bytes() == (whole / "summary.csv").read_bytes()
+    left, expected = (
+        {path.relative_to(run) for run in (of,) for path in run.rglob("*") if path.is_file()}
+        for of in (folder, whole)
+    )
+    # Orbax names its data files at random.
+    assert {path for path in left if "d" not in path.parts} == {
+        path for path in expected if "d" not in path.parts
+    }
+    learned = [path.relative_to(whole) for name in LEARNED for path in (whole / name).iterdir()]
+    assert learned
+    for path in learned:
+        found, wanted = checkpoint.load(folder / path), checkpoint.load(whole / path)
+        chex.assert_trees_all_equal(found, wanted, strict=True)
+
+
+def paths(run, pattern):
+    """What there is; `Path.glob` trips over folders that vanish meanwhile."""
+    return [Path(path) for path in glob.glob(str(run / pattern))]
+
+
+def progress(run):
+    """Steps behind the cells of a run, as far as they are saved."""
+    finished = [path.name for path in paths(run, "policies/*[0-9]")]
+    begun = [
+        path for path in paths(run, "checkpoints/*/[0-9]*") if path.parent.name not in finished
+    ]
+    return STEPS * len(finished) + max((int(path.name) for path in begun), default=0)
+
+
+def wait_for(process, condition):
+    """Wait until `condition` holds or the process has ended."""
+    deadline = time.monotonic() + LIMIT
+    while process.poll() is None and not condition():
+        assert time.monotonic() < deadline, "it hangs"
+        time.sleep(0.0005)
+
+
+def kill(process):
+    """SIGKILL the process; whether it was alive."""
+    process.kill()
+    process.communicate(timeout=LIMIT)
+    return process.returncode == -signal.SIGKILL
+
+
+def test_a_run_that_was_killed_three_times_is_as_one_that_never_was(runs, whole, tmp_path):
+    run = tmp_path / "run"
+    moments = random.Random(0)
+    for number in range(3):
+        process = runs.start(run)
+        steps = moments.randint(1, 2 * STEPS * (number + 1) // 3 - 250)
+        wait_for(process, lambda steps=steps: progress(run) >= steps)
+        time.sleep(moments.uniform(0.0, 0.2))
+        assert kill(process)
+    runs.finish(run)
+    assert_same_run(run, whole)
+
+
+def written_since(moment, run, pattern):
+    """Whether a path of the run was made or changed after `moment`."""
+    for path in paths(run, pattern):
+        with contextlib.suppress(FileNotFoundError):
+            if path.stat().st_mtime > moment:
+                return True
+    return False
+
+
+PHASES = {
+    "compiling": ("../compiled-*/*", 4.0),
+    "training and evaluating": ("checkpoints/*/[0-9]*", 0.5),
+    "saving a checkpoint": ("checkpoints/*/.partial", 0.02),
+    "saving a policy": ("policies/*tmp*", 0.02),
+    "writing tables": (".*.parquet.partial", 0.02),
+    "drawing": ("figures/*", 0.2),
+}
+"""What is written when a phase begins, and seconds that it takes."""
+ATTEMPTS = 20
+"""Processes within which four must be met in the phase."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_run_may_be_killed_in_any_phase(runs, whole, tmp_path, phase):
+    """Four times each, at a random moment of the phase."""
+    run, kills = tmp_path / "run", 0
+    pattern, seconds = PHASES[phase]
+    moments = random.Random(phase)
+    for number in range(ATTEMPTS):
+        fresh = {}
+        if phase == "compiling":
+            fresh["JAX_COMPILATION_CACHE_DIR"] = str(tmp_path / f"compiled-{number}")
+        began = time.time()
+        process = runs.start(run, **fresh)
+        wait_for(process, lambda began=began: written_since(began, run, pattern))
+        time.sleep(moments.uniform(0.0, seconds))
+        kills += kill(process)
+        # It may have been too late.
+        assert process.returncode in (0, -signal.SIGKILL)
+        if (run / "summary.csv").exists():
+            shutil.rmtree(run)
+        if kills == 4:
+            break
+    assert kills == 4
+    runs.finish(run)
+    assert_same_run(run, whole)
+
+
+@pytest.mark.slow
+def test_a_run_may_be_killed_among_its_experts(runs, tmp_path):
+    without_demos = ("--demos", "None", "--experts.seeds", "8", "--experts.steps", "6000")
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    runs.finish(whole, *without_demos)
+    for saved in (500, 2_000):
+        process = runs.start(run, *without_demos)
+        wait_for(process, lambda saved=saved: (run / f"checkpoints/experts/{saved}").exists())
+        assert kill(process)
+    assert "experts goes on from its checkpoint" in runs.finish(run, *without_demos)
+    assert_same_run(run, whole)
+
+
+def test_a_signal_ends_a_run_with_its_code_and_a_line(runs, whole, tmp_path):
+    run = tmp_path / "run"
+    for number, steps in ((signal.SIGINT, 250), (signal.SIGTERM, STEPS + 250)):
+        process = runs.start(run)
+        wait_for(process, lambda steps=steps: progress(run) >= steps)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=LIMIT)
+        assert errors == f"run_grid: stopped by {number.name}; {CONTINUE}"
+        assert process.returncode == 128 + number
+    assert "goes on from its checkpoint" in runs.finish(run)
+    assert_same_run(run, whole)
+
+
+def test_a_run_needs_no_reader(runs, whole, tmp_path):
+    """As `| tee log` where a signal ends `tee` too, and then `> /dev/full`."""
+    run = tmp_path / "run"
+    reader, writer = os.pipe()
+    process = subprocess.Popen(
+        runs.command(run), cwd=ROOT, env=runs.environment, stdout=writer, stderr=writer
+    )
+    os.close(writer)
+    os.read(reader, 1)
+    os.close(reader)
+    wait_for(process, lambda: progress(run) >= 500)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(LIMIT) == 130
+    assert 500 <= progress(run) < 2 * STEPS
+    with open("/dev/full", "w") as full:
+        process = subprocess.run(
+            runs.command(run), cwd=ROOT, env=runs.environment, stdout=full, stderr=full, check=False
+        )
+    assert process.returncode == 0
+    assert_same_run(run, whole)
+
+
+@pytest.fixture
+def again(runs, whole, tmp_path, monkeypatch):
+    """The command within this process, on a run that is finished."""
+    folder = shutil.copytree(whole, tmp_path / "again")
+    monkeypatch.setattr(run_grid, "start_devices", lambda grid: jax.devices()[:1])
+    return lambda: run_grid.main(runs.command(folder)[3:])
+
+
+def test_a_signal_among_the_figures_ends_a_run_at_once(again, monkeypatch, capfd):
+    monkeypatch.setattr(conclusion, "conclude", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    assert again() == 130
+    assert capfd.readouterr() == ("", f"run_grid: stopped at once; {CONTINUE}")
+
+
+def test_a_signal_before_the_figures_is_obeyed(again, monkeypatch, capfd):
+    finished = sealing.finished
+
+    def signalled(folder):
+        signal.raise_signal(signal.SIGINT)
+        return finished(folder)
+
+    monkeypatch.setattr(sealing, "finished", signalled)
+    assert again() == 130
+    assert capfd.readouterr().err == f"run_grid: stopped by SIGINT; {CONTINUE}"
+
+
+def test_a_second_process_is_refused_and_a_crash_frees_the_folder(runs, whole, tmp_path):
+    run = tmp_path / "run"
+    first = runs.start(run)
+    wait_for(first, lambda: progress(run) >= 250)
+    first.send_signal(signal.SIGSTOP)
+    try:
+        # Its other threads may still be on their way to a halt.
+        time.sleep(0.5)
+        before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+        second = runs.start(run)
+        _, errors = second.communicate(timeout=LIMIT)
+        assert errors == f"run_grid: --out: another process is at work in {run}\n"
+        assert second.returncode == 2
+        assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+    finally:
+        assert kill(first)
+    runs.finish(run)
+    assert_same_run(run, whole)
+
+
+def can_mount():
+    if shutil.which("unshare") is None:
+        return False
+    mount = (*ISOLATED, "mount", "-t", "tmpfs", "none", "/mnt")
+    return not subprocess.run(mount, capture_output=True, check=False).returncode
+
+
+needs_mount = pytest.mark.skipif(not can_mount(), reason="this user may not mount a file system")
+
+
+@needs_mount
+def test_a_full_disk_ends_a_run_that_goes_on_once_there_is_room(runs, whole, tmp_path):
+    """It fills up in the second cell: checkpoints fail, then the results do."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    script = """
+        mount -t tmpfs -o size=64m none "$DISK"
+        "$@" &
+        until test -e "$DISK/run/policies/hs-me-ddpg-n1" && ls "$DISK"/run/checkpoints/*n2/[0-9]*
+        do sleep 0.01; done > /dev/null 2> /dev/null
+        dd if=/dev/zero of="$DISK/filler" 2> /dev/null || true
+        status=0
+        wait $! || status=$?
+        echo "status $status"
+        rm "$DISK/filler"
+        "$@"
+        cp -r "$DISK/run" "$COPY"
+    """
+    filled = runs.start(
+        disk / "run",
+        prefix=(*ISOLATED, "bash", "-euc", script, "-"),
+        DISK=str(disk),
+        COPY=str(tmp_path / "copy"),
+    )
+    output, errors = filled.communicate(timeout=LIMIT)
+    assert filled.returncode == 0, errors
+    before, after = output.split("status 1\n")
+    assert "no checkpoint could be saved" in before
+    assert "[2/2] hs-me-ddpg-n2" in before
+    # Where the disk fills up under orbax's hands, it complains too.
+    lines = errors.splitlines(keepends=True)
+    (line,) = [line for line in lines if line.startswith("run_grid: ")]
+    assert "No space left on device" in line
+    assert line.endswith(CONTINUE)
+    assert "[1/1] hs-me-ddpg-n2" in after
+    assert "hs-me-ddpg-n2 goes on from its checkpoint" in after
+    assert_same_run(tmp_path / "copy", whole)
+
+
+@needs_mount
+def test_a_read_only_folder_is_refused(runs, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    script = 'mount -t tmpfs -o ro none "$1"; shift; exec "$@"'
+    refused = runs.start(disk / "run", prefix=(*ISOLATED, "bash", "-euc", script, "-", str(disk)))
+    _, errors = refused.communicate(timeout=LIMIT)
+    assert errors == (f"run_grid: --out: cannot write to {disk / 'run'} (Read-only file system)\n")
+    assert refused.returncode == 2

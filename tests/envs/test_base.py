@@ -1,0 +1,149 @@
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cmedirl_jax import envs, training
+from cmedirl_jax.envs import Env
+from cmedirl_jax.training.methods import METHODS
+
+
+def stepping(env, **changes):
+    """The environment with other fields in what its steps return."""
+
+    def step(key, state, action, params):
+        state, found = env.step(key, state, action, params)
+        return state, found._replace(**{name: change(found) for name, change in changes.items()})
+
+    return env._replace(step=step)
+
+
+def in_state(env, change):
+    """The environment with another state after a step."""
+
+    def step(key, state, action, params):
+        state, found = env.step(key, state, action, params)
+        return change(state), found
+
+    return env._replace(step=step)
+
+
+def resetting(env, change):
+    def reset(key, params):
+        state, observation = env.reset(key, params)
+        return state, change(observation)
+
+    return env._replace(reset=reset)
+
+
+def starting(env, change):
+    return env._replace(starts=lambda count, params: change(*env.starts(count, params)))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "named"),
+    [
+        (lambda env: env._replace(spec=env.spec._replace(action_dim=0)), ValueError, "action_dim"),
+        (
+            lambda env: env._replace(spec=env.spec._replace(max_episode_steps=0)),
+            ValueError,
+            "max_episode_steps must be at least 1",
+        ),
+        (
+            lambda env: env._replace(spec=env.spec._replace(action_high=env.spec.action_low)),
+            ValueError,
+            "action_low must be below action_high",
+        ),
+        (
+            lambda env: resetting(env, lambda seen: seen[:1]),
+            ValueError,
+            r"observation of reset: expected shape \(2,\), got \(1,\)",
+        ),
+        (
+            lambda env: resetting(env, lambda seen: seen.astype(int)),
+            TypeError,
+            "observation of reset: expected floats, got int32",
+        ),
+        (
+            lambda env: stepping(env, observation=lambda found: found.observation[None]),
+            ValueError,
+            r"observation of step: expected shape \(2,\), got \(1, 2\)",
+        ),
+        (
+            lambda env: stepping(env, reward=lambda found: found.observation),
+            ValueError,
+            r"reward: expected shape \(\), got \(2,\)",
+        ),
+        (
+            lambda env: stepping(env, reward=lambda found: found.reward.astype(int)),
+            TypeError,
+            "reward: expected floats, got int32",
+        ),
+        (
+            lambda env: stepping(env, terminated=lambda found: found.terminated * 1.0),
+            TypeError,
+            "terminated: expected bool, got float32",
+        ),
+        (
+            lambda env: stepping(env, truncated=lambda found: found.truncated[None]),
+            ValueError,
+            r"truncated: expected shape \(\), got \(1,\)",
+        ),
+        (
+            lambda env: in_state(env, lambda state: state.replace(time=state.time * 1.0)),
+            ValueError,
+            "state after a step is not of reset's kind",
+        ),
+        (
+            lambda env: in_state(env, lambda state: (state, state.time)),
+            ValueError,
+            "state after a step is not of reset's kind",
+        ),
+        (
+            lambda env: starting(env, lambda states, seen: (states, seen[0])),
+            ValueError,
+            r"observation of starts: expected shape \(2, 2\), got \(2,\)",
+        ),
+        (
+            lambda env: starting(env, lambda states, seen: (states.position, seen)),
+            ValueError,
+            "a state of starts is not of reset's kind",
+        ),
+        (
+            lambda env: env._replace(state_at=lambda seen, params: seen),
+            ValueError,
+            "state_at is not of reset's kind",
+        ),
+    ],
+)
+def test_an_environment_that_does_not_keep_to_its_specification_is_refused(
+    env, spoil, error, named
+):
+    spoilt = spoil(env)
+    with pytest.raises(error, match=rf"^MountainCarContinuous-v0: .*{named}"):
+        envs.check(spoilt)
+    with pytest.raises(error, match=named):
+        training.make(spoilt, METHODS["ddpg"], capacity=10)
+    with pytest.raises(error, match=named):
+        training.fit(jax.random.key(0), spoilt, "ddpg", seeds=1, steps=1, evaluate_every=1)
+
+
+def test_other_parameters_are_checked_too(env):
+    class Params(flax.struct.PyTreeNode):
+        goal_reward: jax.Array
+
+    def step(key, state, action, params):
+        state, found = env.step(key, state, action, env.default_params)
+        return state, found._replace(reward=found.reward + params.goal_reward)
+
+    given = Env(
+        env.spec,
+        Params(jnp.zeros(())),
+        lambda key, params: env.reset(key, env.default_params),
+        step,
+        lambda count, params: env.starts(count, env.default_params),
+    )
+    envs.check(given)
+    with pytest.raises(ValueError, match=r"reward: expected shape \(\), got \(3,\)"):
+        envs.check(given, Params(np.zeros(3, np.float32)))

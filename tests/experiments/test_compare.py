@@ -1,0 +1,212 @@
+import dataclasses
+import json
+import math
+
+import numpy as np
+import polars as pl
+import pytest
+import scipy.stats
+from hypothesis import given, settings
+
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.runs.storage import sealing
+from experiments import compare
+from experiments.presets import PRESETS
+from tests.support import damages
+
+STEPS = np.array([0, 100, 200])
+SEEDS = 6
+
+
+def cell(method, n_demos, curves, diverged=()):
+    """Rows of a finished cell whose seeds have these returns at `STEPS`."""
+    labels = {"method": method, "n_demos": n_demos}
+    evaluations = pl.concat(
+        pl.DataFrame(
+            {
+                **labels,
+                "protocol": "steps",
+                "seed": seed,
+                "env_step": STEPS[: len(curve)],
+                "episode": STEPS[: len(curve)] // 50,
+                "return_mean": np.asarray(curve, float),
+            }
+        )
+        for seed, curve in enumerate(curves)
+    )
+    seeds = pl.DataFrame(
+        {**labels, "seed": range(len(curves)), "diverged": np.isin(range(len(curves)), diverged)}
+    )
+    return {"evaluations": evaluations, "seeds": seeds, "episodes": seeds}
+
+
+def write_config(folder, **changes):
+    grid = dataclasses.replace(PRESETS["smoke"], out=folder, seeds=SEEDS, max_steps=200, **changes)
+    with run_folder.opened(grid):
+        pass
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Method b reaches 90 a hundred steps before a, but for a seed that never does."""
+    write_config(tmp_path)
+    slow, fast, never = [0, 20, 95], [10, 95, 95], [0, 0, 0]
+    sealing.append(tmp_path, cell("a", 0, [slow] * SEEDS))
+    sealing.append(tmp_path, cell("b", 5, [*[fast] * (SEEDS - 1), never]))
+    sealing.append(tmp_path, cell("c", 5, [slow] * SEEDS))
+    sealing.append(tmp_path, cell("never-acts", 5, [[95]] * SEEDS))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A run of two cells, which no test changes for the others."""
+    folder = tmp_path_factory.mktemp("small")
+    write_config(folder)
+    for method, n_demos in (("a", 0), ("b", 5)):
+        sealing.append(folder, cell(method, n_demos, [[0, 20, 95]] * SEEDS))
+    return folder
+
+
+def test_differences_are_of_pairs_of_seeds(folder):
+    table = compare.compare(folder, "a")
+    assert table["method"].unique(maintain_order=True).to_list() == ["b", "c"]
+    found = {row["measure"]: row for row in table.filter(pl.col("method") == "b").to_dicts()}
+    steps = np.array([-100.0] * (SEEDS - 1) + [0.0])  # Never counts as the last step.
+    area = np.array([85 / 3] * (SEEDS - 1) + [-115 / 3])
+    final = np.array([0.0] * (SEEDS - 1) + [-95.0])
+    for name, expected in (
+        ("convergence_env_step", steps),
+        ("area", area),
+        ("final_return", final),
+    ):
+        assert found[name]["difference"] == pytest.approx(expected.mean())
+        assert found[name]["difference_low"] <= expected.mean() <= found[name]["difference_high"]
+        signs = np.array(np.meshgrid(*[[-1, 1]] * SEEDS)).reshape(SEEDS, -1)
+        means = expected @ signs / SEEDS
+        p_value = min(2 * np.mean(means <= -abs(expected.mean()) + 1e-9), 1.0)
+        assert found[name]["p_value"] == pytest.approx(p_value)
+    same = table.filter(pl.col("method") == "c")
+    assert same["difference"].to_list() == [0.0] * 3
+    assert same["p_value"].to_list() == [1.0] * 3
+
+
+def test_a_diverged_seed_stands_at_its_lowest_return(folder):
+    sealing.append(folder, cell("d", 5, [*[[0, 20, 95]] * (SEEDS - 1), [30, 95]], diverged=[5]))
+    table = compare.compare(folder, "a").filter(pl.col("method") == "d")
+    difference = dict(table.select("measure", "difference").iter_rows())
+    assert difference["final_return"] == pytest.approx((30 - 95) / SEEDS)
+    assert difference["area"] == pytest.approx(((30 + 95 + 30) - 115) / 3 / SEEDS)
+
+
+def test_cells_are_compared_at_their_own_number_of_demonstrations(folder):
+    sealing.append(folder, cell("b", 7, [[0, 0, 95]] * SEEDS))
+    sealing.append(folder, cell("c", 7, [[0, 0, 95]] * SEEDS))
+    table = compare.compare(folder, "b").filter(pl.col("measure") == "convergence_env_step")
+    found = {
+        tuple(row[:2]): row[2] for row in table.select("method", "n_demos", "difference").rows()
+    }
+    assert found == {("c", 5): pytest.approx(100 * (SEEDS - 1) / SEEDS), ("c", 7): 0.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "named"), [({"max_episodes": 3}, "over episodes"), ({"seeds": 1}, "one seed")]
+)
+def test_runs_without_paired_curves_are_refused(tmp_path, change, named):
+    write_config(tmp_path)
+    path = tmp_path / "config.json"
+    written = json.loads(path.read_text())
+    written["config"] |= change
+    path.write_text(json.dumps(written))
+    sealing.append(tmp_path, cell("ddpg", 0, [[0, 20, 95]]))
+    with pytest.raises(UserError, match=named):
+        compare.compare(tmp_path, "ddpg")
+
+
+def test_holms_p_values_are_stepwise():
+    found = compare.holm(np.array([0.01, 0.04, 0.03, 0.005]))
+    np.testing.assert_allclose(found, [0.03, 0.06, 0.06, 0.02])
+    assert compare.holm(np.array([0.9, 0.8])).tolist() == [1.0, 1.0]
+
+
+def test_holm_rejects_no_less_than_bonferroni_and_no_more_than_single_tests():
+    p_values = scipy.stats.uniform.rvs(size=20, random_state=0)
+    adjusted = compare.holm(p_values)
+    assert ((adjusted >= p_values) & (adjusted <= np.minimum(20 * p_values, 1.0))).all()
+
+
+def test_the_command_prints_and_writes_the_table(folder, tmp_path, capsys):
+    out = tmp_path / "differences.csv"
+    assert compare.main([str(folder), "--against", "a", "--out", str(out)]) == 0
+    assert "mean paired difference to a" in capsys.readouterr().out
+    assert pl.read_csv(out).height == 2 * 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["nowhere"], "nowhere: holds no finished cell"),
+        (["{folder}", "--against", "ddpg"], "holds no 'ddpg'; its methods are a, b, c"),
+        (["{folder}", "--against", "never-acts"], "holds no 'never-acts'"),
+    ],
+)
+def test_mistakes_are_refused_in_a_line(folder, arguments, named, capsys):
+    assert compare.main([argument.format(folder=folder) for argument in arguments]) == 2
+    error = capsys.readouterr().err
+    assert named in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["config.json", "evaluations.parquet", "seeds.parquet"])
+@settings(max_examples=50)
+@given(damage=damages.damages())
+def test_a_damaged_file_of_a_run_is_a_users_error_or_harmless(small, name, damage):
+    with damages.done_to(small / name, damage):
+        table, refusal = damages.attempt(UserError, compare.compare, small, "a")
+    if refusal is not None:
+        assert str(small) in refusal
+        assert "\n" not in refusal
+    else:
+        assert set(table["measure"]) == set(compare.MEASURES)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("config.json", b""),
+        ("config.json", b"[" * 100_000),
+        ("config.json", b'{"config": []}'),
+        ("config.json", b'{"config": {"max_episodes": null, "seeds": "many"}}'),
+        ("evaluations.parquet", b"PAR1"),
+        ("evaluations.parquet", pl.DataFrame({"another": [1]})),
+        ("evaluations.parquet", pl.DataFrame({"method": ["a"], "n_demos": [0]})),
+        ("seeds.parquet", pl.DataFrame({"method": ["a"], "n_demos": [0]})),
+        ("seeds.parquet", None),
+    ],
+)
+def test_a_run_of_other_files_is_refused_in_a_line(small, name, content, capsys):
+    path, whole = small / name, (small / name).read_bytes()
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is None:
+        path.unlink()
+    else:
+        content.write_parquet(path)
+    assert compare.main([str(small), "--against", "a"]) == 2
+    path.write_bytes(whole)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(f"compare: {small}")
+    assert "damaged" in captured.err
+    assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("curves", [[[0, 1, 2]] * (SEEDS - 1), [[0, math.nan, 2]] * SEEDS])
+def test_cells_of_fewer_seeds_or_undefined_returns_are_refused(small, curves):
+    whole = {path: path.read_bytes() for path in small.iterdir()}
+    sealing.append(small, cell("c", 5, curves))
+    with pytest.raises(UserError, match=f"c has no finite returns of {SEEDS} seeds"):
+        compare.compare(small, "a")
+    for path, content in whole.items():
+        path.write_bytes(content)

@@ -1,0 +1,168 @@
+import matplotlib.pyplot as plt
+import numpy as np
+import polars as pl
+import pytest
+
+from cmedirl_jax.runs import statistics
+from experiments import figures
+
+THRESHOLD = 90.0
+STEPS = (0, 250, 500)
+NEVER = (0.0, 10.0, 20.0)
+LATE = (0.0, 10.0, 95.0)
+AT_ONCE = (94.0, 80.0, 95.0)
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    yield
+    plt.close("all")
+
+
+def run(cells, seeds=3):
+    """The tables and the summary of a run whose cells have these curves.
+
+    Seed i returns i more than the curve and finishes i + 2 episodes.
+    """
+    evaluations = pl.DataFrame(
+        [
+            {
+                "expert": "best" if n_demos else "none",
+                "method": method,
+                "n_demos": n_demos,
+                "protocol": protocol,
+                "seed": seed,
+                "env_step": env_step,
+                "episode": env_step // 250,
+                "return_mean": value + seed if protocol == "steps" else 1e6,
+            }
+            for (method, n_demos), curve in cells.items()
+            for protocol in ("episodes", "steps")
+            for seed in range(seeds)
+            for env_step, value in zip(STEPS, curve, strict=True)
+        ]
+    )
+    episodes = pl.DataFrame(
+        [
+            {
+                "method": method,
+                "n_demos": n_demos,
+                "seed": seed,
+                "episode": episode,
+                "return": 10.0 * episode + seed,
+            }
+            for method, n_demos in cells
+            for seed in range(seeds)
+            for episode in range(1, seed + 3)
+        ]
+    )
+    numbers = dict.fromkeys(
+        ("env_steps", "episodes", "demonstration_steps", "expert_steps", "best_return"), 1
+    )
+    replay = {"gymnasium_return": 1.0, "gymnasium_difference": 0.0, "diverged": False}
+    per_seed = pl.DataFrame([{"seed": seed, **numbers, **replay} for seed in range(seeds)])
+    summary = pl.DataFrame(
+        [
+            statistics.summarise(
+                evaluations.filter(pl.col("method") == method, pl.col("n_demos") == n_demos),
+                per_seed,
+                THRESHOLD,
+                max_episodes=None,
+            )
+            for method, n_demos in cells
+        ],
+        infer_schema_length=None,
+    )
+    return evaluations, episodes, summary
+
+
+ONE_NUMBER = {("ddpg", 0): NEVER, ("hs-ddpg", 10): AT_ONCE}
+TWO_NUMBERS = {
+    ("ddpg", 0): LATE,
+    ("hs-ddpg", 1): AT_ONCE,
+    ("hs-ddpg", 10): AT_ONCE,
+    ("me-ddpg", 1): NEVER,
+    ("me-ddpg", 10): LATE,
+}
+
+
+@pytest.mark.parametrize(
+    ("cells", "names"),
+    [
+        (ONE_NUMBER, ["figure3"]),
+        (TWO_NUMBERS, ["figure3", "figure4", "figure5"]),
+        ({("ddpg", 0): NEVER}, ["figure3"]),
+    ],
+)
+def test_figures_4_and_5_need_several_numbers_of_demonstrations(cells, names, tmp_path):
+    paths = figures.draw(tmp_path / "figures", *run(cells), 94.0, THRESHOLD)
+    expected = {f"{name}.{suffix}" for name in names for suffix in ("png", "svg")}
+    assert {path.name for path in paths} == expected
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == expected
+    for path in paths:
+        assert path.read_bytes().startswith(b"\x89PNG" if path.suffix == ".png" else b"<?xml")
+
+
+def test_the_same_tables_give_the_same_bytes(tmp_path):
+    tables = run(TWO_NUMBERS)
+    first, second = (figures.draw(tmp_path / name, *tables, 94.0, THRESHOLD) for name in ("a", "b"))
+    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+
+
+def test_cells_that_never_converged_can_be_drawn(tmp_path):
+    cells = dict.fromkeys(TWO_NUMBERS, NEVER)
+    assert figures.draw(tmp_path / "figures", *run(cells, seeds=1), None, THRESHOLD)
+
+
+def test_figure_3_has_the_mean_of_the_seeds_over_steps():
+    evaluations, episodes, _ = run({("ddpg", 0): LATE})
+    left, _ = figures.average_return(evaluations, episodes, None, THRESHOLD).axes
+    curve = left.lines[0]
+    assert curve.get_label() == "DDPG"
+    np.testing.assert_array_equal(curve.get_xdata(), STEPS)
+    np.testing.assert_allclose(curve.get_ydata(), np.add(LATE, 1.0))
+
+
+def test_figure_3_shows_the_largest_number_of_demonstrations_alone(tmp_path, monkeypatch):
+    drawn = {}
+
+    def average_return(evaluations, episodes, *_):
+        drawn.update(evaluations=evaluations, episodes=episodes)
+        return plt.figure()
+
+    monkeypatch.setattr(figures, "average_return", average_return)
+    figures.draw(tmp_path / "figures", *run(TWO_NUMBERS), None, THRESHOLD)
+    for table in drawn.values():
+        assert set(table["n_demos"]) == {0, 10}
+
+
+def test_a_curve_over_episodes_stops_where_the_first_seed_runs_out():
+    evaluations, episodes, _ = run({("ddpg", 0): LATE})
+    _, right = figures.average_return(evaluations, episodes, None, THRESHOLD).axes
+    curve = right.lines[0]
+    np.testing.assert_array_equal(curve.get_xdata(), [1, 2])
+    np.testing.assert_allclose(curve.get_ydata(), [11.0, 21.0])
+
+
+def test_a_method_with_a_seed_that_finished_no_episode_has_no_curve_over_episodes():
+    evaluations, episodes, _ = run({("ddpg", 0): LATE})
+    episodes = episodes.filter(pl.col("seed") > 0)
+    _, right = figures.average_return(evaluations, episodes, None, THRESHOLD).axes
+    assert [line.get_label() for line in right.lines] == ["solved"]
+
+
+def test_figure_4_leaves_out_what_never_converged():
+    _, _, summary = run(TWO_NUMBERS)
+    left, right = figures.convergence(summary).axes
+    for axes, median in ((left, 2.0), (right, 500.0)):
+        by_label = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+        np.testing.assert_array_equal(by_label["DDPG"].get_ydata(), [median] * 2)
+        np.testing.assert_array_equal(by_label["ME-DDPG"][0].get_ydata(), [np.nan, median])
+        np.testing.assert_array_equal(by_label["HS-DDPG"][0].get_ydata(), [0.0, 0.0])
+
+
+def test_more_methods_than_colours_have_lines_of_their_own():
+    methods = [f"method {index}" for index in range(2 * len(figures.COLOURS) + 1)]
+    lines = figures._lines(pl.DataFrame({"method": methods}))
+    assert list(lines) == methods
+    assert len({tuple(line.values()) for line in lines.values()}) == len(methods)

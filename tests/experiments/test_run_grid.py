@@ -1,0 +1,539 @@
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+from cmedirl_jax.data import demonstrations
+from cmedirl_jax.io import checkpoint
+from cmedirl_jax.runs import run as run_lib
+from cmedirl_jax.runs.cells import experts
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.runs.storage import sealing
+from cmedirl_jax.training.methods import METHODS
+from experiments import run_grid
+from tests.support import ROOT, pools
+
+SMOKE = ("--preset", "smoke")
+START_DEVICES = run_grid.start_devices
+TABLES = tuple(f"{name}.parquet" for name in sealing.TABLES)
+
+
+def snapshot(folder):
+    """Everything below `folder`: files with their bytes, folders with None."""
+    paths = sorted(folder.rglob("*"))
+    return {path: path.read_bytes() if path.is_file() else None for path in paths}
+
+
+def run_command(*arguments, **environment):
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.run_grid", *map(str, arguments)],
+        cwd=ROOT,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture
+def main(tmp_path, monkeypatch):
+    """The command in an empty working directory, on a device of this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_grid, "start_devices", lambda grid: jax.devices()[:1])
+    return lambda *arguments: run_grid.main([str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def refused(main, tmp_path, capsys):
+    """Run a command that must be refused; returns its one line without the program's name."""
+
+    def run(*arguments):
+        before = snapshot(tmp_path)
+        assert main(*arguments) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("run_grid: ")
+        assert snapshot(tmp_path) == before
+        return line.removeprefix("run_grid: ")
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (
+            "--methods maxent-irl --tabular.states 1",
+            "--tabular.states: must be at least 2, got 1",
+        ),
+        (
+            "--methods maxent-irl --tabular.centres 1",
+            "--tabular.centres: must be at least 2, got 1",
+        ),
+        ("--tabular.steps 0", "--tabular.steps: must be at least 1, got 0"),
+        (
+            "--schedule.frozen-actor-steps -1",
+            "--schedule.frozen-actor-steps: must be at least 0, got -1",
+        ),
+        (
+            "--exploration.hot-start-factor 0",
+            "--exploration.hot-start-factor: must be positive and finite, got 0.0",
+        ),
+        (
+            "--exploration.kind epsilon-greedy --exploration.hot-start-factor 1.5",
+            "--exploration.hot-start-factor: makes epsilon 1.5, above 1",
+        ),
+        ("--methods ddpg td3", f"--methods: unknown method 'td3'; there are {', '.join(METHODS)}"),
+        ("--methods", "--methods: give one or more, each once"),
+        ("--methods ddpg ddpg", "--methods: give one or more, each once"),
+        ("--n-demos", "--n-demos: give one or more, each once"),
+        ("--n-demos 5 5", "--n-demos: give one or more, each once"),
+        ("--n-demos 2000", "--n-demos: 2000 asked, the pool holds 1024"),
+        (
+            "--env Walker2d-v5",
+            "--env: unknown environment 'Walker2d-v5'; there are: MountainCarContinuous-v0",
+        ),
+        ("--max-steps None", "--max-steps: give a number, or give --max-episodes"),
+        ("--seed -1", "--seed: must be between 0 and 2^32 - 1, got -1"),
+        (
+            "--demos none.npz",
+            "--demos: there is no file none.npz; give one that demonstrations.save wrote",
+        ),
+        (
+            "--demos D4RL/door/human-v2",
+            "--demos: there is no file D4RL/door/human-v2; give one that demonstrations.save wrote",
+        ),
+        (
+            f"--max-steps None --max-episodes {2**31 - 1}",
+            f"--max-episodes: makes {999 * (2**31 - 1)} steps, more than 2^31 - 1",
+        ),
+    ],
+)
+def test_what_cannot_work_is_refused_in_a_line(refused, arguments, line):
+    assert refused(*arguments.split()) == line
+
+
+@pytest.mark.parametrize("size", [0, -3])
+@pytest.mark.parametrize(
+    "option",
+    [
+        "--n-demos",
+        "--seeds",
+        "--max-steps",
+        "--max-episodes",
+        "--evaluate-every",
+        "--evaluation-starts",
+        "--evaluate-every-episodes",
+        "--devices",
+        "--experts.seeds",
+        "--experts.trajectories",
+        "--schedule.batch-size",
+        "--schedule.replay-capacity",
+        "--reward-schedule.period",
+        "--hot-start.cells",
+        "--architecture.hidden",
+        "--reward-network.hidden",
+    ],
+)
+def test_sizes_must_be_positive(refused, option, size):
+    assert refused(option, size) == f"{option}: must be at least 1, got {size}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        ("--architecture.action-layer 5", "--architecture"),
+        (f"--seed {2**64}", "--seed"),
+        (f"--out {'x' * 300}", "--out"),
+    ],
+)
+def test_what_only_the_library_finds_is_refused_too(refused, arguments, option):
+    assert refused("--methods", "ddpg", *arguments.split()).startswith(f"{option}: ")
+
+
+def test_more_devices_than_there_are_are_refused(refused, monkeypatch):
+    monkeypatch.setattr(run_grid, "start_devices", START_DEVICES)
+    assert refused("--devices", 10**6, "--out", "run").startswith("--devices: 1000000 asked, there")
+
+
+@pytest.fixture
+def demos(tmp_path):
+    """A demonstrations file of three episodes."""
+    path = tmp_path / "demos.npz"
+    demonstrations.save(path, pools.scripted(3))
+    return path
+
+
+def test_more_demonstrations_than_the_file_holds_are_refused(refused, demos):
+    line = refused("--demos", demos, "--n-demos", 1, 4)
+    assert line == "--n-demos: 4 asked, the pool holds 3"
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "empty",
+        "garbage",
+        "cut short",
+        "foreign",
+        "pickle",
+        "another environment",
+        "undefined",
+        "out of bounds",
+        "folder",
+        "pipe",
+    ],
+)
+def test_a_demonstrations_file_that_cannot_be_used_is_refused(refused, demos, damage):
+    match damage:
+        case "empty":
+            demos.write_bytes(b"")
+        case "garbage":
+            demos.write_bytes(b"garbage")
+        case "cut short":
+            demos.write_bytes(demos.read_bytes()[:-100])
+        case "pickle":
+            np.savez(demos, allow_pickle=True, header=np.array([{}], dtype=object))
+        case "undefined" | "out of bounds":
+            with np.load(demos) as file:
+                arrays = dict(file)
+            arrays["action"][5] = np.nan if damage == "undefined" else 2.0
+            np.savez(demos, **arrays)
+        case "folder" | "pipe":
+            demos.unlink()
+            (demos.mkdir if damage == "folder" else lambda: os.mkfifo(demos))()
+        case "foreign":
+            np.savez(demos, observation=np.zeros(3))
+        case "another environment":
+            pool = pools.scripted(3)._replace(metadata={"env": "Pendulum-v1"})
+            demonstrations.save(demos, pool)
+    assert refused("--demos", demos, "--n-demos", 1).startswith(f"--demos: {demos}: ")
+
+
+@pytest.mark.parametrize(
+    ("metadata", "named"),
+    [
+        ({"expert": {"name": "human"}}, "expert in its metadata is {'name': 'human'}"),
+        ({"expert": None}, "expert in its metadata is None"),
+        ({"expert_env_steps": "1e5"}, "expert_env_steps in its metadata is '1e5'"),
+        ({"expert_env_steps": True}, "expert_env_steps in its metadata is True"),
+        ({"expert_env_steps": -1}, "expert_env_steps in its metadata is -1"),
+        ({"expert_env_steps": 2**63}, f"expert_env_steps in its metadata is {2**63}"),
+    ],
+)
+def test_metadata_that_no_table_can_hold_is_refused(refused, tmp_path, metadata, named):
+    pool = pools.scripted(5)
+    demonstrations.save(tmp_path / "pool.npz", pool._replace(metadata=pool.metadata | metadata))
+    assert named in refused(*SMOKE, "--demos", "pool.npz", "--out", "run")
+
+
+SHORT_OF_MEMORY = (
+    MemoryError(),
+    jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: of no use"),
+    jax.errors.JaxRuntimeError("INTERNAL: Out of memory allocating 9 bytes"),
+)
+
+
+@pytest.mark.parametrize("error", SHORT_OF_MEMORY)
+def test_a_run_that_does_not_fit_in_memory_is_refused(refused, monkeypatch, error):
+    def make_pool(*_):
+        raise error
+
+    monkeypatch.setattr(experts, "make_pool", make_pool)
+    assert "memory is too small" in refused(*SMOKE, "--out", "run")
+
+
+def test_a_run_that_runs_out_of_memory_keeps_its_checkpoints(main, monkeypatch, tmp_path, capsys):
+    saved = tmp_path / "run" / "checkpoints" / "experts" / "250"
+
+    def make_pool(*_):
+        saved.mkdir(parents=True)
+        raise MemoryError
+
+    monkeypatch.setattr(experts, "make_pool", make_pool)
+    assert main(*SMOKE, "--out", "run") == 1
+    assert "Cannot allocate memory; what is finished is kept" in capsys.readouterr().err
+    assert saved.exists()
+
+
+@pytest.mark.parametrize("out", ["file", "file/run"])
+def test_a_folder_that_cannot_be_made_is_refused(refused, tmp_path, out):
+    (tmp_path / "file").touch()
+    assert refused("--out", out).startswith(f"--out: cannot write to {out} (")
+
+
+@pytest.mark.parametrize(
+    ("option", "before", "now"), [("--seeds", 8, 3), ("--agent.tau", 0.01, 0.5)]
+)
+def test_another_configuration_in_the_same_folder_is_refused(refused, option, before, now):
+    arguments = (*SMOKE, "--out", "run")
+    with run_folder.opened(run_grid.parse(arguments)):
+        pass
+    line = refused(*arguments, option, now)
+    assert line.startswith(f"--out: run holds a run with {option} {before}, not {now};")
+
+
+@pytest.mark.parametrize(
+    "out",
+    [
+        "run",
+        "new/run",
+        "old",
+    ],
+)
+def test_a_run_without_an_able_expert_leaves_everything_as_it_was(
+    refused, monkeypatch, tmp_path, out
+):
+    def make_pool(*_):
+        raise UserError("--experts: none")
+
+    monkeypatch.setattr(experts, "make_pool", make_pool)
+    (tmp_path / "old").mkdir()
+    assert refused(*SMOKE, "--out", out) == "--experts: none"
+
+
+def test_a_mistake_ends_the_process_with_code_2_and_one_line(tmp_path):
+    done = run_command("--seeds", 0, "--out", tmp_path / "run")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == "run_grid: --seeds: must be at least 1, got 0\n"
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory, compiled):
+    """The folder and the output of a whole run."""
+    folder = tmp_path_factory.mktemp("smoke") / "run"
+    done = run_command(*SMOKE, "--out", folder, **compiled)
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+CELLS = {("ddpg", 0): "ddpg"} | {
+    (method, 5): f"{method}-n5" for method in ("hs-ddpg", "me-ddpg", "hs-me-ddpg")
+}
+SEEDS, STEPS = 8, (0, 250, 500)
+
+
+def test_a_run_leaves_what_the_design_lists_and_nothing_unfinished(smoke):
+    folder, done = smoke
+    assert {path.name for path in folder.iterdir()} == {
+        *("config.json", "summary.csv", "demonstrations", "figures", "policies", "rewards"),
+        ".lock",
+        *sealing.FILES,
+    }
+    figures = {path.name: path.stat().st_size for path in (folder / "figures").iterdir()}
+    assert figures.keys() == {"figure3.png", "figure3.svg"}
+    assert all(figures.values())
+    assert {path.name for path in (folder / "policies").iterdir()} == set(CELLS.values())
+    assert {path.name for path in (folder / "rewards").iterdir()} == {
+        "me-ddpg-n5",
+        "hs-me-ddpg-n5",
+    }
+    assert json.loads((folder / "config.json").read_text())["config"]["seeds"] == SEEDS
+    assert "[1/5] experts" in done.stdout
+    # Any array made before the devices are started would leave one.
+    assert f"on {min(run_grid.cores(), 2)} CPU device(s)" in done.stdout
+    assert str(folder) in done.stdout
+
+
+def test_a_run_evaluates_every_seed_of_every_cell_from_step_0_on(smoke):
+    table = pl.read_parquet(smoke[0] / "evaluations.parquet")
+    assert set(table.columns) >= {
+        *("expert", "method", "n_demos", "seed", "env_step", "episode"),
+        *("return_mean", "return_std", "goal_fraction", "length_mean", "q_mean", "critic_loss"),
+    }
+    assert table.select("method", "n_demos", "seed", "env_step").rows() == [
+        (*cell, seed, step) for cell in CELLS for seed in range(SEEDS) for step in STEPS
+    ]
+    losses = ("q_mean", "critic_loss")
+    of_rewards = ("demonstration_reward", "background_reward", "effective_sample_size")
+    assert table.drop(*losses, *of_rewards).null_count().sum_horizontal().item() == 0
+    learned = table.filter(
+        pl.col("method").str.ends_with("me-ddpg"), pl.col("env_step") == STEPS[-1]
+    )
+    assert learned.select(of_rewards).null_count().sum_horizontal().item() == 0
+
+
+def test_episodes_have_the_designed_columns_and_follow_each_other(smoke):
+    table = pl.read_parquet(smoke[0] / "episodes.parquet")
+    assert set(table.columns) >= {
+        *("expert", "method", "n_demos", "seed", "episode", "env_step"),
+        *("return", "length", "terminated"),
+    }
+    assert set(table["method"]) >= {"hs-ddpg", "hs-me-ddpg"}
+    assert table["env_step"].max() <= STEPS[-1]
+    for learner in table.partition_by("method", "n_demos", "seed"):
+        np.testing.assert_array_equal(learner["length"].cum_sum(), learner["env_step"])
+
+
+def test_only_methods_that_use_demonstrations_name_an_expert(smoke):
+    for name in TABLES:
+        table = pl.read_parquet(smoke[0] / name)
+        assert set(table.select("method", "n_demos", "expert").unique().rows()) == {
+            (method, n_demos, "best" if n_demos else "none") for method, n_demos in CELLS
+        }
+
+
+def test_demonstrations_are_a_valid_pool_of_the_size_asked(smoke, spec):
+    pool = demonstrations.load(smoke[0] / "demonstrations" / "pool.npz", spec)
+    assert demonstrations.returns(pool).size == 64
+    assert pool.metadata["expert"] == "best"
+    assert demonstrations.returns(pool).mean() > spec.reward_threshold
+
+
+def test_the_summary_has_a_row_per_cell_and_counts_the_steps(smoke, spec):
+    summary = pl.read_csv(smoke[0] / "summary.csv")
+    assert summary.select("method", "n_demos").rows() == list(CELLS)
+    assert summary["seeds"].to_list() == [SEEDS] * 4
+    assert summary["diverged"].to_list() == [0] * 4
+    assert summary["env_steps_learner"].to_list() == [SEEDS * STEPS[-1]] * 4
+    assert summary["env_steps_expert"].to_list() == [0, *[8 * 6_000] * 3]
+    # The seeds of every method that uses demonstrations draw the same ones.
+    without, *drawn = summary["env_steps_demonstrations"]
+    assert without == 0
+    assert len(set(drawn)) == 1
+    pool = demonstrations.load(smoke[0] / "demonstrations" / "pool.npz", spec)
+    length = demonstrations.episodes(pool).length
+    assert 5 * SEEDS * length.min() <= drawn[0] <= 5 * SEEDS * length.max()
+
+
+def test_policies_and_rewards_of_all_seeds_are_kept_and_agree_with_gymnasium(smoke):
+    folder, _ = smoke
+    for path in (*(folder / "policies").iterdir(), *(folder / "rewards").iterdir()):
+        leaves = jax.tree.leaves(checkpoint.load(path))
+        assert {leaf.shape[0] for leaf in leaves} == {SEEDS}
+    seeds = pl.read_parquet(folder / "seeds.parquet")
+    assert seeds["gymnasium_difference"].max() < 1e-3
+    hot_started = seeds.filter(pl.col("method").str.starts_with("hs-"))
+    assert hot_started["gymnasium_return"].min() > 90.0
+
+
+def test_a_finished_run_is_left_alone(smoke, main, monkeypatch, capsys):
+    folder, done = smoke
+    before = snapshot(folder)
+    monkeypatch.setattr(run_lib, "_train_cells", lambda *_: pytest.fail("it trains again"))
+    assert main(*SMOKE, "--out", folder) == 0
+    assert snapshot(folder) == before
+    assert done.stdout.endswith(capsys.readouterr().out)
+
+
+def test_figures_that_are_gone_are_drawn_again(smoke, main, tmp_path):
+    folder = shutil.copytree(smoke[0], tmp_path / "run")
+    shutil.rmtree(folder / "figures")
+    assert main(*SMOKE, "--out", folder) == 0
+    assert (folder / "figures" / "figure3.png").exists()
+    assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
+
+
+def test_a_finished_run_refuses_another_configuration(smoke, main, capsys):
+    before = snapshot(smoke[0])
+    assert main(*SMOKE, "--out", smoke[0], "--expert", "median") == 2
+    assert "--expert best, not median" in capsys.readouterr().err
+    assert snapshot(smoke[0]) == before
+
+
+def test_a_run_cut_off_between_cells_resumes_to_the_same_tables(smoke, compiled, tmp_path):
+    folder = shutil.copytree(
+        smoke[0], tmp_path / "run", ignore=shutil.ignore_patterns(*sealing.FILES)
+    )
+    tables = sealing.read(smoke[0])
+    for method, n_demos in list(CELLS)[:-1]:
+        of_cell = (pl.col("method") == method) & (pl.col("n_demos") == n_demos)
+        sealing.append(folder, {name: table.filter(of_cell) for name, table in tables.items()})
+    (folder / "summary.csv").unlink()
+
+    done = run_command(*SMOKE, "--out", folder, **compiled)
+
+    assert done.returncode == 0, done.stderr
+    assert "[1/1] hs-me-ddpg-n5" in done.stdout
+    for name in TABLES:
+        assert_frame_equal(pl.read_parquet(folder / name), pl.read_parquet(smoke[0] / name))
+    assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
+
+
+@pytest.mark.skipif(run_grid.cores() < 2, reason="there is one core")
+def test_seeds_do_not_depend_on_the_devices_that_share_them(tmp_path, compiled):
+    returns = []
+    for devices in (1, 2):
+        out = tmp_path / str(devices)
+        size = ("--seeds", 9, "--max-steps", 300, "--architecture.hidden", 8)
+        done = run_command(
+            "--methods", "ddpg", *size, "--devices", devices, "--out", out, **compiled
+        )
+        assert done.returncode == 0, done.stderr
+        assert f"9 seeds per cell on {devices} CPU device(s)" in done.stdout
+        returns.append(pl.read_parquet(out / "evaluations.parquet")["return_mean"].to_numpy())
+    assert returns[0].size == 9 * 3
+    np.testing.assert_allclose(*returns, rtol=1e-3, atol=1e-3)
+
+
+def test_methods_with_a_model_run_beside_the_others(compiled, demos, tmp_path):
+    methods = ("ddpg", "tabular-me-ddpg", "maxent-irl", "deep-maxent-irl")
+    tiny = {"states": 9, "actions": 3, "steps": 2, "centres": 3}
+    folder = tmp_path / "run"
+    done = run_command(
+        *(*SMOKE, "--methods", *methods, "--n-demos", 1, 2, "--demos", demos),
+        *("--seeds", 2, "--max-steps", 250, "--out", folder),
+        *(part for name, value in tiny.items() for part in (f"--tabular.{name}", value)),
+        **compiled,
+    )
+    assert done.returncode == 0, done.stderr
+    summary = pl.read_csv(folder / "summary.csv")
+    assert summary["method"].to_list() == ["ddpg", *(name for name in methods[1:] for _ in (1, 2))]
+    acts = pl.col("method").str.ends_with("ddpg")
+    modelled = summary.filter(~acts)
+    for column in modelled.columns:
+        if column.startswith(("converg", "sustained", "dip", "return_after")):
+            assert modelled[column].null_count() == 4, column
+    assert modelled["soft_return_mean"].null_count() == 0
+    assert summary.filter(acts)["soft_return_mean"].null_count() == 3
+    assert modelled["env_steps_learner"].to_list() == [0] * 4
+    assert (modelled["gymnasium_difference_max"] < 0.05).all()
+    evaluations = pl.read_parquet(folder / "evaluations.parquet").filter(~acts)
+    assert evaluations.height == 4 * 2 * 2
+    assert set(evaluations["protocol"]) == {"steps", "soft"}
+    assert set(evaluations["env_step"]) == {0}
+    for name in ("maxent-irl-n1", "deep-maxent-irl-n2", "tabular-me-ddpg-n2"):
+        reward = checkpoint.load(folder / "rewards" / name)
+        assert reward.shape[0] == 2
+        assert np.isfinite(reward).all()
+    assert {"figure3.png", "figure4.png", "figure5.png"} <= {
+        path.name for path in (folder / "figures").iterdir()
+    }
+
+
+def test_comparators_and_controls_run_beside_the_others(compiled, demos, tmp_path):
+    methods = ("bc", "gail", "ddpg-minus-constant", "random-reward")
+    folder = tmp_path / "run"
+    done = run_command(
+        *(*SMOKE, "--methods", *methods, "--n-demos", 2, "--demos", demos),
+        *("--seeds", 2, "--max-steps", 250, "--out", folder),
+        *("--hot-start.steps", 5, "--gail.form", "logit D"),
+        **compiled,
+    )
+    assert done.returncode == 0, done.stderr
+    summary = pl.read_csv(folder / "summary.csv")
+    assert summary["method"].to_list() == list(methods)
+    assert summary["n_demos"].to_list() == [2, 2, 0, 0]
+    assert summary["env_steps_learner"].to_list() == [0, 500, 500, 500]
+    assert summary["converged_fraction"].null_count() == 1
+    assert summary["diverged"].sum() == 0
+    evaluations = pl.read_parquet(folder / "evaluations.parquet")
+    assert evaluations.filter(pl.col("method") == "bc")["env_step"].to_list() == [0, 0]
+    learned = evaluations.filter(pl.col("demonstration_reward").is_not_null())
+    assert set(learned["method"]) == {"gail"}
+    constant = checkpoint.load(folder / "rewards" / "ddpg-minus-constant")
+    np.testing.assert_allclose(constant, [-0.1, -0.1])
+    assert {path.name for path in (folder / "rewards").iterdir()} == {
+        "gail-n2",
+        "ddpg-minus-constant",
+        "random-reward",
+    }

@@ -1,0 +1,89 @@
+import errno
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cmedirl_jax.data import demonstrations
+from cmedirl_jax.io import atomic, checkpoint
+from cmedirl_jax.runs.console.signals import Interruption
+from cmedirl_jax.runs.storage.checkpoints import Keeper
+from tests.support import pools
+
+
+@pytest.fixture
+def events(monkeypatch):
+    """What is flushed and moved, in order, each with its path at that time."""
+    events, fsync, replace = [], os.fsync, os.replace
+
+    def noted_fsync(descriptor):
+        events.append(("flush", Path(os.readlink(f"/proc/self/fd/{descriptor}"))))
+        fsync(descriptor)
+
+    def noted_replace(source, target):
+        events.append(("move", Path(source)))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", noted_fsync)
+    monkeypatch.setattr(os, "replace", noted_replace)
+    return events
+
+
+def assert_safe(events, path, partial):
+    """All that is at `path` was flushed before it was moved there; then the folder was."""
+    below = [partial / found.relative_to(path) for found in path.rglob("*")]
+    moved = events.index(("move", partial))
+    for found in (partial, *below):
+        assert ("flush", found) in events[:moved]
+    assert ("flush", path.parent) in events[moved:]
+
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="there is no /proc")
+
+
+@needs_proc
+def test_a_file_and_a_folder_are_flushed_before_they_take_their_names(tmp_path, events):
+    (tmp_path / "file.partial").write_text("new")
+    (tmp_path / "file").write_text("old")
+    atomic.replace(tmp_path / "file.partial", tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "new"
+    assert_safe(events, tmp_path / "file", tmp_path / "file.partial")
+    (tmp_path / "partial" / "deep").mkdir(parents=True)
+    (tmp_path / "partial" / "deep" / "file").touch()
+    atomic.replace(tmp_path / "partial", tmp_path / "folder")
+    assert_safe(events, tmp_path / "folder", tmp_path / "partial")
+
+
+@needs_proc
+def test_demonstrations_are_flushed(tmp_path, events):
+    demonstrations.save(tmp_path / "pool.npz", pools.scripted(2))
+    assert_safe(events, tmp_path / "pool.npz", tmp_path / "pool.npz.partial")
+
+
+@needs_proc
+def test_checkpoints_are_flushed(tmp_path, events):
+    with Keeper(tmp_path, {}, every=0.0, interruption=Interruption(), say=pytest.fail) as keeper:
+        keeper.visit(250, lambda: ({"weights": np.zeros(3)}, {"rows": np.arange(2)}))
+    assert_safe(events, tmp_path / "250", tmp_path / ".partial")
+
+
+@needs_proc
+def test_a_tree_that_was_saved_is_flushed(tmp_path, events):
+    checkpoint.save(tmp_path / "tree", {"weights": np.zeros(3)})
+    flushed = {path for what, path in events if what == "flush"}
+    assert flushed >= {tmp_path, tmp_path / "tree", *(tmp_path / "tree").rglob("*")}
+
+
+def test_a_file_system_that_flushes_no_folders_will_do(tmp_path, monkeypatch):
+    def fail(number):
+        def fsync(descriptor):
+            raise OSError(number, os.strerror(number))
+
+        return fsync
+
+    monkeypatch.setattr(os, "fsync", fail(errno.EINVAL))
+    atomic.flush(tmp_path)
+    monkeypatch.setattr(os, "fsync", fail(errno.EIO))
+    with pytest.raises(OSError, match="Input/output error"):
+        atomic.flush(tmp_path)

@@ -1,0 +1,94 @@
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cmedirl_jax.irl import IRLHParams, controls, rewards
+from cmedirl_jax.types import Network
+from tests.support.agents import SPEC, random_batch
+
+KEY = jax.random.key(0)
+OF_ONE = controls.random(SPEC, IRLHParams(bound=1.0))
+BOUNDED = controls.random(SPEC, IRLHParams(bound=0.2))
+PAIRS = tuple(
+    np.random.default_rng(0).uniform(low, high, (5000, len(low))).astype(np.float32)
+    for low, high in (
+        (SPEC.observation_low, SPEC.observation_high),
+        (SPEC.action_low, SPEC.action_high),
+    )
+)
+
+init = jax.jit(OF_ONE.init)
+
+
+@jax.jit
+def standardised(state, *pairs):
+    """What the bound squashes."""
+    return jnp.arctanh(OF_ONE.reward(state, *pairs))
+
+
+def test_a_constant_is_the_same_everywhere():
+    control = controls.constant(-0.3)
+    state = control.init(KEY)
+    for leading in ((), (4,), (2, 3)):
+        found = control.reward(state, jnp.zeros((*leading, 2)), jnp.ones((*leading, 1)))
+        np.testing.assert_array_equal(found, np.full(leading, -0.3, np.float32))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_random_reward_has_mean_zero_and_deviation_one_over_other_uniform_pairs(seed):
+    found = np.float64(standardised(init(jax.random.key(seed)), *PAIRS))
+    # 1024 pairs standardise it, so its mean is off by 1/32 or so.
+    assert abs(found.mean()) < 0.15
+    assert found.std() == pytest.approx(1.0, abs=0.1)
+
+
+def test_its_mean_and_deviation_are_those_of_the_network_over_the_bounds(skewed_spec):
+    """Of a network that is a coordinate, the moments of a uniform law are known."""
+    coordinates = [
+        (lambda observation, action: observation[..., 2], 2.0, 10.0),
+        (lambda observation, action: action[..., 1], 0.5, 1.0),
+    ]
+    for coordinate, low, high in coordinates:
+        network = Network(
+            lambda key: (), lambda params, *inputs, coordinate=coordinate: coordinate(*inputs)
+        )
+        _, mean, deviation = controls.random(skewed_spec, network=network).init(KEY).params
+        wide = high - low
+        np.testing.assert_allclose(mean, 0.5 * (low + high), atol=0.05 * wide)
+        np.testing.assert_allclose(deviation, wide / np.sqrt(12), rtol=0.1)
+
+
+def test_the_bound_squashes_the_standardised_network():
+    found = BOUNDED.reward(BOUNDED.init(KEY), *PAIRS)
+    np.testing.assert_allclose(found, 0.2 * np.tanh(standardised(init(KEY), *PAIRS)), atol=1e-5)
+    assert np.std(found) > 0.1
+
+
+@pytest.mark.parametrize("control", [controls.constant(0.1), OF_ONE], ids=["constant", "random"])
+def test_updates_learn_nothing(control):
+    before, batch = control.init(KEY), random_batch(KEY, 5)
+    after, info = control.update(before, batch, batch, key=KEY)
+    chex.assert_trees_all_equal(after, before)
+    assert not np.any(info)
+
+
+def test_each_seed_has_its_own_random_reward():
+    keys = jax.random.split(KEY, 3)
+    states = jax.jit(jax.vmap(OF_ONE.init))(keys)
+    together = jax.jit(jax.vmap(OF_ONE.reward, in_axes=(0, None, None)))(states, *PAIRS)
+    for index, key in enumerate(keys):
+        alone = standardised(init(key), *PAIRS)
+        np.testing.assert_allclose(together[index], np.tanh(alone), rtol=1e-3, atol=1e-4)
+    correlation = np.corrcoef(together)
+    assert np.abs(correlation[np.triu_indices(3, 1)]).max() < 0.99
+    constant = controls.constant(0.1)
+    np.testing.assert_array_equal(jax.vmap(constant.init)(keys).params, np.float32([0.1] * 3))
+
+
+@pytest.mark.parametrize("bound", ["observation_low", "action_high"])
+def test_infinite_bounds_are_refused(bound):
+    spec = SPEC._replace(**{bound: np.full_like(getattr(SPEC, bound), np.inf)})
+    with pytest.raises(ValueError, match=r"MountainCarContinuous-v0: .* finite bounds"):
+        controls.random(spec, network=rewards.mlp(SPEC))

@@ -1,0 +1,218 @@
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import jax
+import pytest
+from hypothesis import given, settings
+
+from cmedirl_jax.irl import IRLHParams
+from cmedirl_jax.runs.config import StudyConfig
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.training.methods import Settings
+from experiments.presets import PRESETS
+from tests.support import damages
+
+
+@pytest.fixture
+def grid(tmp_path):
+    return StudyConfig(out=tmp_path / "run")
+
+
+def contents(folder):
+    """Every file below `folder`, with its bytes."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def opened(grid):
+    """Enter the run's folder and leave it; returns the folder."""
+    with run_folder.opened(grid) as folder:
+        return folder
+
+
+def test_configuration_is_strict_json_with_versions(tmp_path):
+    settings = dataclasses.replace(
+        PRESETS["paper"].settings, reward=IRLHParams(gauge_rate=math.inf)
+    )
+    grid = dataclasses.replace(PRESETS["paper"], out=tmp_path, settings=settings)
+    with run_folder.opened(grid) as folder:
+        text = (folder / "config.json").read_text()
+    written = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert written["schema"] == run_folder.SCHEMA
+    assert written["versions"]["jax"] == jax.__version__
+    assert written["config"]["n_demos"] == [200]
+    assert written["config"]["settings"]["reward"]["gauge_rate"] == "inf"
+    assert written["config"]["settings"]["hot_start"]["critic"] == "softmax"
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_same_configuration_enters_again_and_changes_nothing(preset, tmp_path):
+    grid = dataclasses.replace(PRESETS[preset], out=tmp_path)
+    opened(grid)
+    before = contents(tmp_path)
+    assert opened(grid) == tmp_path
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"seeds": 3}, "--seeds 100, not 3;"),
+        ({"n_demos": (1, 10)}, "--n-demos [200], not [1, 10];"),
+        ({"max_steps": None, "max_episodes": 5}, "--max-episodes None, not 5;"),
+        ({"demos": Path(__file__)}, f"--demos None, not {__file__};"),
+        (
+            {"settings": Settings(reward=IRLHParams(weight_limit=5.0))},
+            "--reward.weight-limit None, not 5.0;",
+        ),
+    ],
+)
+def test_another_configuration_is_refused_naming_the_option_and_both_values(grid, change, named):
+    folder = opened(grid)
+    before = contents(folder)
+    with pytest.raises(UserError) as error:
+        opened(dataclasses.replace(grid, **change))
+    assert str(error.value).startswith("--out: ")
+    assert named in str(error.value)
+    assert "\n" not in str(error.value)
+    assert contents(folder) == before
+
+
+def test_the_folders_spelling_and_the_devices_are_not_compared(grid, monkeypatch):
+    folder = opened(grid)
+    monkeypatch.chdir(folder.parent)
+    respelled = dataclasses.replace(grid, out=Path(folder.name), devices=2)
+    assert opened(respelled).samefile(folder)
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        b"",
+        b"{",
+        b"\xff",
+        b"[]",
+        b"[" * 100_000,
+        b'{"config": {}}',
+        b'{"schema": 1}',
+        b'{"schema": 1, "config": []}',
+        b'{"schema": 2, "config": {}}',
+        b'{"schema": 1, "config": {}, "versions": []}',
+    ],
+)
+def test_a_damaged_or_newer_configuration_is_refused_and_kept(grid, damaged):
+    path = opened(grid) / "config.json"
+    path.write_bytes(damaged)
+    with pytest.raises(UserError, match=r"^--out: .*config\.json"):
+        opened(grid)
+    assert path.read_bytes() == damaged
+
+
+@pytest.mark.parametrize("below", ["file", "file/run", "file/deep/run"])
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path, below):
+    file = tmp_path / "file"
+    file.write_text("kept")
+    with pytest.raises(UserError, match=r"^--out: cannot write to "):
+        opened(StudyConfig(out=tmp_path / below))
+    assert contents(tmp_path) == {file: b"kept"}
+
+
+def test_a_folder_that_holds_something_else_is_refused_and_left_alone(grid):
+    (grid.folder / "checkpoints").mkdir(parents=True)
+    (grid.folder / "checkpoints" / "model.bin").write_bytes(b"somebody's")
+    before = contents(grid.folder)
+    with pytest.raises(UserError, match=r"^--out: .* holds checkpoints and no config\.json"):
+        opened(grid)
+    assert contents(grid.folder) == before
+
+
+def test_a_folder_whose_run_was_killed_at_once_is_taken(grid):
+    grid.folder.mkdir()
+    (grid.folder / ".lock").touch()
+    (grid.folder / ".config.json.partial").write_text("{")
+    assert {path.name for path in opened(grid).iterdir()} == {".lock", "config.json"}
+
+
+UNFINISHED = (
+    *(".seeds.parquet.partial", ".tables.json.partial", "demonstrations/pool.npz.partial"),
+    "policies/ddpg.orbax-checkpoint-tmp-0/file",
+)
+SOMEBODYS = (".notes.partial", "downloads/film.partial", "policies/mine", "notes.txt")
+
+
+def write(folder, names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(name)
+
+
+def test_what_a_killed_run_left_is_removed_and_nothing_else(grid):
+    opened(grid)
+    write(grid.folder, (*UNFINISHED, *SOMEBODYS))
+    opened(grid)
+    found = {str(path.relative_to(grid.folder)) for path in contents(grid.folder)}
+    assert found == {".lock", "config.json", *SOMEBODYS}
+
+
+def refused_at_work(grid, names):
+    with run_folder.opened(grid) as folder:
+        write(folder, names)
+        raise UserError("no expert")
+
+
+@pytest.mark.parametrize("out", ["run", "deep/run", "a/../run"])
+def test_a_refusal_at_work_removes_what_is_the_runs_own(tmp_path, out):
+    with pytest.raises(UserError, match="no expert"):
+        refused_at_work(
+            StudyConfig(out=tmp_path / out), ("checkpoints/1", "demonstrations/pool.npz")
+        )
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_refusal_at_work_leaves_what_somebody_else_put_there(grid):
+    with pytest.raises(UserError, match="no expert"):
+        refused_at_work(grid, ("checkpoints/1", "notes.txt"))
+    assert {path.name for path in contents(grid.folder)} == {"notes.txt"}
+
+
+def test_a_damaged_table_is_refused_before_anything_is_removed(grid):
+    opened(grid)
+    write(grid.folder, (*UNFINISHED, "seeds.parquet"))
+    before = contents(grid.folder)
+    with pytest.raises(UserError, match="damaged table"):
+        opened(grid)
+    assert contents(grid.folder) == before
+
+
+@pytest.mark.parametrize("name", run_folder.FOLDERS)
+def test_a_file_where_a_folder_belongs_is_refused(grid, name):
+    opened(grid)
+    (grid.folder / name).touch()
+    with pytest.raises(UserError, match=f"^--out: .*{name} is in the way"):
+        opened(grid)
+
+
+@pytest.mark.parametrize("name", ["two\nlines", "not\udcffutf-8"])
+def test_a_name_that_cannot_be_printed_is_refused(tmp_path, name):
+    with pytest.raises(UserError, match=r"^--out: .* cannot be printed") as error:
+        opened(StudyConfig(out=tmp_path / name))
+    assert str(error.value).isprintable()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run's folder, and its configuration."""
+    grid = StudyConfig(out=tmp_path_factory.mktemp("whole"))
+    opened(grid)
+    return grid
+
+
+@settings(max_examples=100)
+@given(damage=damages.damages())
+def test_a_damaged_configuration_is_a_users_error_or_harmless(whole, damage):
+    with damages.done_to(whole.folder / "config.json", damage):
+        _, refusal = damages.attempt(UserError, run_folder.check, whole)
+    assert refusal is None or refusal.startswith("--out: ")
+    assert "\n" not in str(refusal)

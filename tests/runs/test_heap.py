@@ -1,0 +1,69 @@
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from cmedirl_jax.runs import heap
+
+# Eight threads that allocate at the same time, each from the arena that it was given.
+SCRIPT = """
+import ctypes, re, sys, tempfile, threading
+from experiments import heap
+
+if sys.argv[1:]:
+    heap.share(arenas=int(sys.argv[1]))
+libc = ctypes.CDLL(None)
+libc.malloc.restype = ctypes.c_void_p
+libc.fdopen.restype = ctypes.c_void_p
+met = threading.Barrier(8)
+
+def allocate():
+    met.wait()
+    libc.malloc(1_000)
+    met.wait()
+
+threads = [threading.Thread(target=allocate) for _ in range(8)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+with tempfile.TemporaryFile() as file:
+    stream = ctypes.c_void_p(libc.fdopen(file.fileno(), b"w"))
+    libc.malloc_info(0, stream)
+    libc.fflush(stream)
+    file.seek(0)
+    print(len(re.findall(b"<heap nr=", file.read())))
+"""
+
+
+def arenas(*arguments, **environment):
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, *arguments],
+        env={**{k: v for k, v in os.environ.items() if k != "MALLOC_ARENA_MAX"}, **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return int(done.stdout)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="arenas are glibc's")
+def test_threads_share_the_arenas_that_there_may_be():
+    assert arenas() > 3
+    assert arenas("1") == 1
+    assert arenas("3") == 3
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="arenas are glibc's")
+def test_what_the_user_says_stays():
+    assert arenas("1", MALLOC_ARENA_MAX="3") == 3
+
+
+@pytest.mark.parametrize("system", ["linux", "darwin"])
+def test_another_c_library_is_left_alone(system, monkeypatch):
+    monkeypatch.delenv("MALLOC_ARENA_MAX", raising=False)
+    monkeypatch.setattr(heap.sys, "platform", system)
+    monkeypatch.setattr(heap.ctypes, "CDLL", lambda _: object())
+    heap.share(arenas=2)

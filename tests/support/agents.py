@@ -1,0 +1,54 @@
+"""A small agent on the car, random batches, and its float64 reference."""
+
+import jax
+import numpy as np
+
+from cmedirl_jax import envs, networks
+from cmedirl_jax.networks import Architecture
+from cmedirl_jax.types import EnvSpec, Transition
+from tests.support import reference
+
+SPEC = envs.make("MountainCarContinuous-v0").spec
+CENTRE, HALF_WIDTH = np.array([-0.3, 0.0]), np.array([0.9, 0.07])
+SMALL = networks.make(SPEC, Architecture(hidden=(5, 4), output_scale=0.5))
+
+
+def random_batch(key, size, spec=SPEC):
+    keys = jax.random.split(key, 5)
+    low, high = spec.observation_low, spec.observation_high
+
+    def observations(key):
+        return jax.random.uniform(key, (size, spec.observation_dim), minval=low, maxval=high)
+
+    return Transition(
+        observation=observations(keys[0]),
+        action=jax.random.uniform(keys[1], (size, spec.action_dim), minval=-1.0, maxval=1.0),
+        reward=jax.random.normal(keys[2], (size,)),
+        next_observation=observations(keys[3]),
+        terminated=jax.random.bernoulli(keys[4], 0.3, (size,)),
+    )
+
+
+def scaled(observation):
+    return (np.asarray(observation, np.float64) - CENTRE) / HALF_WIDTH
+
+
+def reference_q(critic, observation, action):
+    return reference.mlp(critic, scaled(observation), np.asarray(action), normalise=True)[:, 0]
+
+
+def reference_pre_activation(actor, observation):
+    return reference.mlp(actor, scaled(observation))
+
+
+PROBE = EnvSpec(
+    id="probe",
+    observation_dim=1,
+    action_dim=1,
+    observation_low=np.array([-1.0], np.float32),
+    observation_high=np.array([1.0], np.float32),
+    action_low=np.array([-1.0], np.float32),
+    action_high=np.array([1.0], np.float32),
+    max_episode_steps=1,
+    reward_threshold=0.0,
+)

@@ -1,0 +1,41 @@
+"""A small pool of demonstrations by a scripted controller of known quality."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax import envs
+from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.types import Transition
+
+ENV = envs.make("MountainCarContinuous-v0")
+
+
+def controller(observation, push=0.3):
+    """Push in the direction of motion: a mean return of about 97.7, or with 0.8 of 92.9."""
+    return push * jnp.where(observation[..., 1:] >= 0, 1.0, -1.0)
+
+
+@functools.cache
+def scripted(episodes=12, push=0.3):
+    """`episodes` episodes of `controller`, from evenly spread starts."""
+    rows = []
+    advance = jax.jit(ENV.step)
+    for index in range(episodes):
+        states, observations = ENV.starts(episodes, ENV.default_params)
+        state = jax.tree.map(lambda leaf, index=index: leaf[index], states)
+        observation, done = observations[index], False
+        while not done:
+            action = controller(observation, push)
+            state, step = advance(jax.random.key(0), state, action, ENV.default_params)
+            done = bool(step.terminated | step.truncated)
+            transition = Transition(
+                observation, action, step.reward, step.observation, step.terminated
+            )
+            rows.append((*transition, step.truncated & ~step.terminated, np.int32(index)))
+            observation = step.observation
+    columns = [np.stack(column) for column in zip(*rows, strict=True)]
+    metadata = {"env": ENV.spec.id}
+    return Demonstrations(Transition(*columns[:5]), columns[5], columns[6], metadata)

@@ -1,0 +1,109 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cmedirl_jax.agents import hot_start
+from cmedirl_jax.data import demonstrations
+from cmedirl_jax.data.demonstrations import DemonstrationSubset
+from cmedirl_jax.tabular import discretise, imitation
+from cmedirl_jax.tabular.imitation import TabularSettings
+from cmedirl_jax.tabular.interpolation import points
+from cmedirl_jax.training import evaluation
+from tests.support import pools
+from tests.support.compiling import jit_as_users
+
+SMALL = TabularSettings(states=11, actions=3, steps=3, centres=3, hidden=(8,))
+
+
+@pytest.fixture(scope="module")
+def data():
+    return hot_start.data(pools.scripted())
+
+
+@pytest.fixture(scope="module")
+def mdp():
+    return jax.jit(lambda: imitation.discretised(pools.ENV, SMALL))()
+
+
+@pytest.mark.parametrize("chosen", [None, [2], [0, 3, 1]])
+def test_visitation_counts_discounted_steps_where_they_were(data, mdp, chosen):
+    """A loop over the chosen demonstrations; their mean place and action are kept."""
+    pool = data.episodes
+    which = range(len(pool.start)) if chosen is None else chosen
+    subset = None
+    if chosen is not None:
+        # Padded, as a traced number of demonstrations needs.
+        start = np.append(np.asarray(pool.start)[chosen], pool.start[1])
+        length = np.append(np.asarray(pool.length)[chosen], 0)
+        subset = DemonstrationSubset(jnp.asarray(start), jnp.asarray(length))
+    found = jax.jit(lambda subset: imitation.visitation(mdp, data, subset, discount=0.9))(subset)
+    total, place, action, first = 0.0, np.zeros(2), np.zeros(1), np.zeros(2)
+    for episode in which:
+        begin, steps = int(pool.start[episode]), int(pool.length[episode])
+        weight = 0.9 ** np.arange(steps) / len(which)
+        rows = slice(begin, begin + steps)
+        total += weight.sum()
+        place += weight @ data.transition.observation[rows]
+        action += weight @ data.transition.action[rows]
+        first += data.transition.observation[begin] / len(which)
+    grid, levels = points(mdp.states), points(mdp.actions)
+    visits = np.asarray(found.visitation)
+    np.testing.assert_allclose(visits.sum(), total, rtol=1e-5)
+    np.testing.assert_allclose(visits[:-1].sum(1) @ grid, place, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(visits.sum(0) @ levels, action, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(found.initial[:-1] @ grid, first, rtol=1e-4, atol=1e-5)
+    assert (visits >= 0).all()
+    assert (visits[-1] == 0).all()
+
+
+@pytest.mark.parametrize("reward", ["state", "state-action"])
+@pytest.mark.parametrize("kind", ["linear", "deep"])
+def test_every_reward_is_fitted_and_vmaps(data, mdp, kind, reward):
+    settings = dataclasses.replace(SMALL, reward=reward)
+
+    def fit(key, mdp, data):
+        subset_key, key = jax.random.split(key)
+        subset = demonstrations.subset(subset_key, data.episodes, 2)
+        return imitation.fit(key, mdp, pools.ENV.spec, data, subset, kind=kind, settings=settings)
+
+    keys = jax.random.split(jax.random.key(0), 2)
+    found = jax.jit(jax.vmap(fit, in_axes=(0, None, None)))(keys, mdp, data)
+    assert found.reward.shape == (2, 122, 3)
+    spread = np.ptp(np.asarray(found.reward), axis=2).max()
+    assert spread == 0 if reward == "state" else spread > 1e-4
+    error = found.info.visitation_error
+    assert (error[:, -1] < error[:, 0]).all()
+    assert (np.asarray(found.reward[0]) != np.asarray(found.reward[1])).any()
+
+
+@pytest.mark.optimised
+@pytest.mark.parametrize("kind", ["linear", "deep"])
+def test_the_reward_of_twelve_demonstrations_solves_the_task(kind):
+    """Greedily and softly, from each of 20 start states."""
+    settings = TabularSettings()
+    env, params = pools.ENV, pools.ENV.default_params
+    data = hot_start.data(pools.scripted(push=0.6))
+
+    @jit_as_users
+    def returns(data):
+        mdp = imitation.discretised(env, settings)
+        found = imitation.fit(jax.random.key(0), mdp, env.spec, data, kind=kind, settings=settings)
+        starts = env.starts(20, params)
+        greedy = discretise.greedy(mdp, found.policy.action_values)
+        soft = discretise.sampled(mdp, env)
+        return [
+            evaluation.rollout(greedy, env, params, starts).episode_return,
+            evaluation.rollout(
+                lambda o: discretise.look_up(mdp, found.policy.log_probabilities, o),
+                soft,
+                params,
+                starts,
+            ).episode_return,
+        ]
+
+    greedy, soft = returns(data)
+    assert greedy.min() > 90
+    assert soft.min() > 90

@@ -1,0 +1,197 @@
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from cmedirl_jax import networks, tabular
+from cmedirl_jax.tabular import Stop, TabularDemonstrations
+from cmedirl_jax.types import Network
+from tests.support import mdps
+
+EXACT = Stop(tolerance=1e-13)
+
+
+@pytest.fixture(autouse=True)
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def expert(dynamics, reward, initial, absorbing, discount=0.9, horizon=None):
+    """The visitation of the soft-optimal policy of `reward`, as if of infinitely many episodes."""
+    kwargs = {"discount": discount, "horizon": horizon, "absorbing": absorbing}
+    policy = tabular.soft_value_iteration(dynamics, jnp.asarray(reward), stop=EXACT, **kwargs)
+    visitation = tabular.expected_visitation(
+        dynamics, policy, jnp.asarray(initial), stop=EXACT, **kwargs
+    )
+    return TabularDemonstrations(visitation, jnp.asarray(initial))
+
+
+def two_layers(inputs, hidden=32):
+    mlp = networks.MLP(hidden=(hidden,), output_dim=1)
+
+    def init(key):
+        return jax.tree.map(lambda leaf: leaf.astype(float), mlp.init(key, jnp.zeros((1, inputs))))
+
+    return networks.scalar_output(Network(init, mlp.apply))
+
+
+def test_empirical_visitation_counts():
+    state = np.array([[0, 1, 1], [2, 0, 0]])
+    action = np.array([[1, 0, 1], [1, 1, 0]])
+    mask = np.array([[True, True, True], [True, False, False]])
+    found = tabular.empirical_visitation(state, action, mask, (3, 2), discount=0.5)
+    np.testing.assert_allclose(found.visitation, [[0, 0.5], [0.25, 0.125], [0, 0.5]])
+    np.testing.assert_allclose(found.initial, [0.5, 0, 0.5])
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.5])
+@pytest.mark.parametrize("horizon", [None, 4])
+@pytest.mark.parametrize("state_only", [False, True])
+def test_a_step_follows_the_log_posteriors_gradient(state_only, horizon, temperature):
+    """Autodiff through the whole log-likelihood, against the difference in visitation."""
+    dynamics, reward, initial, ends = mdps.random_mdp(0, absorbing=True)
+    demonstrations = expert(dynamics, reward, initial, ends, horizon=horizon)
+    rng = np.random.default_rng(1)
+    features = rng.normal(size=(4, 2) if state_only else (4, 3, 2))
+    kwargs = {"discount": 0.9, "horizon": horizon, "absorbing": ends, "stop": EXACT}
+    first, second = (
+        tabular.maxent_irl(
+            dynamics,
+            features,
+            demonstrations,
+            temperature=temperature,
+            prior_precision=0.3,
+            optimizer=optax.sgd(0.1),
+            steps=steps,
+            **kwargs,
+        )
+        for steps in (1, 2)
+    )
+
+    def log_posterior(theta):
+        reward = jnp.broadcast_to((features @ theta).reshape(4, -1), (4, 3))
+        policy = tabular.soft_value_iteration(dynamics, reward, temperature=temperature, **kwargs)
+        value = initial @ (policy.values if horizon is None else policy.values[0])
+        data = jnp.sum(demonstrations.visitation * reward) - value
+        return data / temperature - 0.15 * jnp.sum(theta**2)
+
+    gradient = jax.grad(log_posterior)(first.params)
+    np.testing.assert_allclose(second.params, first.params + 0.1 * gradient, atol=1e-10)
+    np.testing.assert_allclose(
+        second.info.log_likelihood[1] + second.info.log_prior[1], log_posterior(first.params)
+    )
+    if state_only:
+        np.testing.assert_array_equal(first.reward, first.reward[:, :1].repeat(3, axis=1))
+
+
+def test_a_reward_of_states_sees_the_sum_over_actions():
+    """mu_D = sum_a mu_D^a, as below Eq. 9: only the state's visits move a reward of states."""
+    dynamics, reward, initial, _ = mdps.random_mdp(1)
+    demonstrations = expert(dynamics, reward, initial, None)
+    shuffled = demonstrations._replace(visitation=demonstrations.visitation[:, ::-1])
+    of_states, of_pairs = (
+        [
+            tabular.maxent_irl(
+                dynamics, features, found, discount=0.9, optimizer=optax.sgd(0.1), steps=1
+            ).params
+            for found in (demonstrations, shuffled)
+        ]
+        for features in (np.eye(4), np.eye(12).reshape(4, 3, 12))
+    )
+    np.testing.assert_allclose(*of_states, rtol=1e-12)
+    assert np.abs(of_pairs[0] - of_pairs[1]).max() > 0.01
+
+
+@pytest.mark.parametrize("optimizer", [optax.adam(0.1), optax.lbfgs()], ids=["adam", "lbfgs"])
+def test_the_optimum_matches_the_demonstrations_visitation(optimizer):
+    dynamics, reward, initial, ends = mdps.random_mdp(2, absorbing=True)
+    demonstrations = expert(dynamics, reward, initial, ends)
+    features = np.eye(12).reshape(4, 3, 12)
+    found = jax.jit(
+        lambda: tabular.maxent_irl(
+            dynamics,
+            features,
+            demonstrations,
+            discount=0.9,
+            absorbing=ends,
+            optimizer=optimizer,
+            steps=400,
+            stop=EXACT,
+        )
+    )()
+    np.testing.assert_allclose(found.visitation, demonstrations.visitation, atol=1e-4)
+    assert found.info.log_likelihood[-1] >= found.info.log_likelihood.max() - 1e-9
+    assert found.info.visitation_error[-1] < 1e-3 < found.info.visitation_error[0]
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.2])
+@pytest.mark.parametrize("deep", [False, True], ids=["linear", "deep"])
+def test_the_reward_of_a_gridworld_is_recovered(deep, slip):
+    """From 1,000 sampled episodes: the policy it induces has 0.99 of the expert's value."""
+    dynamics, ends = mdps.gridworld(5, slip)
+    states = len(dynamics)
+    row, column = np.divmod(np.arange(states), 5)
+    swamp = (row == 2) & (column < 3)
+    truth = np.where(swamp, -6.0, -2.0)[:, None].repeat(4, axis=1)
+    kwargs = {"discount": 0.95, "absorbing": ends}
+    starts = np.full(states, ~ends / (states - 1))
+    ideal = tabular.soft_value_iteration(dynamics, jnp.asarray(truth), stop=EXACT, **kwargs)
+    rng = np.random.default_rng(0)
+    episodes = np.zeros((1000, 100, 2), int)
+    mask = np.zeros((1000, 100), bool)
+    for episode in range(1000):
+        state = rng.choice(states, p=starts)
+        for time in range(100):
+            if ends[state]:
+                break
+            action = rng.choice(4, p=np.exp(ideal.log_probabilities[state]))
+            episodes[episode, time], mask[episode, time] = (state, action), True
+            state = rng.choice(states, p=dynamics[state, action])
+    demonstrations = tabular.empirical_visitation(
+        *np.moveaxis(episodes, -1, 0), mask, (states, 4), discount=0.95
+    )
+    fit = (
+        functools.partial(
+            tabular.deep_maxent_irl, jax.random.key(0), two_layers(states), (np.eye(states),)
+        )
+        if deep
+        else functools.partial(tabular.maxent_irl, features=np.eye(states))
+    )
+    found = jax.jit(
+        lambda: fit(
+            dynamics=dynamics, demonstrations=demonstrations, prior_precision=1e-4, **kwargs
+        )
+    )()
+    values = []
+    for policy in (found.policy, ideal):
+        mu = tabular.expected_visitation(dynamics, policy, jnp.asarray(starts), **kwargs)
+        values.append(float(jnp.sum(mu * (truth - policy.log_probabilities))))
+    found_value, ideal_value = values
+    # Entropy counts in, so that the expert's value is the greatest there is; both are below zero.
+    assert ideal_value / 0.99 <= found_value <= ideal_value < -5.0
+
+
+def test_seeds_vmap():
+    dynamics, reward, initial, ends = mdps.random_mdp(3, absorbing=True)
+    network = two_layers(3, hidden=4)
+    places = np.random.default_rng(0).normal(size=(4, 3))
+    every = [expert(dynamics, scale * reward, initial, ends) for scale in (0.5, 1.0, 2.0)]
+    keys = jax.random.split(jax.random.key(0), 3)
+
+    def fit(key, demonstrations):
+        found = tabular.deep_maxent_irl(
+            key, network, (places,), dynamics, demonstrations, discount=0.9, absorbing=ends, steps=5
+        )
+        return found.reward, found.visitation
+
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *every)
+    together = jax.jit(jax.vmap(fit))(keys, stacked)
+    alone = jax.jit(fit)
+    for index, demonstrations in enumerate(every):
+        one = jax.tree.map(lambda leaf, index=index: leaf[index], together)
+        chex.assert_trees_all_close(one, alone(keys[index], demonstrations), rtol=1e-5, atol=1e-6)

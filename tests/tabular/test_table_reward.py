@@ -1,0 +1,40 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax.irl import IRLHParams, shaping
+from cmedirl_jax.tabular import discretise, interpolation, table_reward
+from tests.support import pools
+
+STATES, ACTIONS = discretise.grids(pools.ENV.spec, (6, 5), (3,))
+TABLE = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
+LEARNER = table_reward.make(STATES, ACTIONS)
+
+
+def test_the_reward_is_the_scaled_table_at_the_grids_points():
+    state = table_reward.state(jnp.asarray(TABLE), IRLHParams(bound=0.2))
+    observation = np.repeat(interpolation.points(STATES)[:, None], 3, axis=1)
+    action = np.broadcast_to(interpolation.points(ACTIONS), (30, 3, 1))
+    found = LEARNER.reward(state, observation, action)
+    np.testing.assert_allclose(found, 0.2 * TABLE / np.abs(TABLE).max(), atol=1e-5)
+
+
+def test_between_the_points_it_is_linear_in_the_action():
+    state = table_reward.state(jnp.asarray(TABLE), IRLHParams())
+    observation = jnp.tile(jnp.array([-0.31, 0.013]), (3, 1))
+    low, middle, high = LEARNER.reward(state, observation, jnp.array([[-1.0], [-0.75], [0.0]]))
+    np.testing.assert_allclose(middle, 0.75 * low + 0.25 * high, rtol=1e-5)
+
+
+def test_it_learns_nothing():
+    state = table_reward.state(jnp.asarray(TABLE), IRLHParams())
+    batch = jax.tree.map(lambda leaf: leaf[:4], pools.scripted().transition)
+    after, _ = LEARNER.update(state, batch, batch)
+    np.testing.assert_array_equal(after.params, state.params)
+    nothing = LEARNER.reward(LEARNER.init(jax.random.key(0)), *batch[:2])
+    assert nothing.tolist() == [0.0] * 4
+    np.testing.assert_array_equal(shaping.additive(batch.reward, nothing), batch.reward)
+
+
+def test_a_table_of_zeros_stays_zero():
+    assert (table_reward.state(jnp.zeros((30, 3)), IRLHParams()).params == 0).all()

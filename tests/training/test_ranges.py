@@ -1,0 +1,62 @@
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cmedirl_jax.agents.ddpg import DDPGHParams
+from cmedirl_jax.networks import Architecture
+from cmedirl_jax.training import compose, ranges
+from cmedirl_jax.training.methods import METHODS, Settings
+
+
+def with_tau(tau):
+    return dataclasses.replace(Settings(), agent=DDPGHParams(tau=tau))
+
+
+def test_the_defaults_are_in_range():
+    ranges.check(Settings())
+
+
+@pytest.mark.parametrize(
+    "interval", dict.fromkeys(ranges.RANGES.values()), ids=lambda interval: interval.words
+)
+def test_a_range_holds_its_ends_and_nothing_beyond_or_undefined(interval):
+    one = dataclasses.make_dataclass("One", [("number", float)])
+
+    def wrong(value):
+        return list(ranges.out_of_range(one(value), {"number": interval}))
+
+    assert not wrong(interval.low)
+    assert not wrong(interval.high)
+    beyond = math.nextafter(interval.low, -math.inf), math.nextafter(interval.high, math.inf)
+    for outside in (*beyond, math.inf, -math.inf):
+        ((name, what),) = wrong(outside)
+        assert name == "number"
+        assert what.endswith(f", got {outside}")
+    assert wrong(math.nan) == [("number", f"must be {interval.words}, got nan")]
+
+
+def test_what_32_bits_cannot_hold_is_out_of_range():
+    ((_, wrong),) = ranges.out_of_range(with_tau(1e-50), ranges.RANGES)
+    assert wrong == "must be above 0 and at most 1, got 1e-50"
+    settings = dataclasses.replace(Settings(), architecture=Architecture(hidden=(64, 2**31)))
+    ((_, wrong),) = ranges.out_of_range(settings, ranges.RANGES)
+    assert wrong == "must be at most 2^31 - 1, got 2147483648"
+
+
+def test_composition_refuses_them_by_name(spec):
+    with pytest.raises(ValueError, match=r"^agent.tau must be above 0 and at most 1, got -1$"):
+        compose.compose(spec, METHODS["ddpg"], with_tau(-1), capacity=10)
+
+
+def test_traced_numbers_and_arrays_pass():
+    def tau(value):
+        settings = with_tau(value)
+        ranges.check(settings)
+        return settings.agent.tau
+
+    np.testing.assert_array_equal(jax.jit(jax.vmap(tau))(jnp.array([0.5, -1.0])), [0.5, -1.0])
+    ranges.check(with_tau(jnp.array(-1.0)))

@@ -1,0 +1,20 @@
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax.data import replay
+from cmedirl_jax.training import updates
+from cmedirl_jax.training.methods import METHODS
+from tests.support.trainers import ENV, start, with_
+
+
+def test_a_terminated_transition_earns_what_the_absorbing_state_goes_on_to():
+    settings = with_(reward={"absorbing": True})
+    trainer, state, _ = start("me-ddpg", settings)
+    update = updates.make(trainer.algorithm, METHODS["me-ddpg"], settings)
+    reward = state.reward.replace(params=state.reward.params._replace(absorbing=jnp.asarray(0.3)))
+    batch = replay.unpack(ENV.spec, jnp.ones((2, 7)))._replace(terminated=jnp.array([False, True]))
+    shaped = update.shape(reward, batch, 0.9, 0.5)
+    r_d = trainer.algorithm.learner.reward(reward, batch.observation, batch.action)
+    absorbing = 0.1 * np.tanh(0.3)
+    expected = batch.reward + 0.5 * (r_d + np.array([0.0, 0.9 / (1 - 0.9) * absorbing]))
+    np.testing.assert_allclose(shaped.reward, expected, rtol=1e-5)
