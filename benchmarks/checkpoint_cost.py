@@ -14,43 +14,47 @@ from rich.console import Console
 
 from benchmarks import measuring, ours
 from cmedirl_jax.runs.cells import cell as cell_lib
-from cmedirl_jax.runs.cells.compiled import Programs
+from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.console import compile_cache
 from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import checkpoints
-from cmedirl_jax.runs.storage.checkpoints import Keeper
+from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.training.methods import Settings
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What to measure, and where to write it."""
+    """What to measure, and where to write it.
+
+    Attributes:
+        seeds: Learners of the cell, DDPG as `run_grid` trains it, on every core.
+        steps: Steps of each; the replay saved is the main job's, of 12,000.
+        every: Seconds between checkpoints: far more of them than a run makes, so that their cost
+            shows.
+        rounds: How often the cell is trained with and without, in turn.
+        json: File for the measurements.
+    """
 
     seeds: int = 100
-    """Learners of the cell, DDPG as `run_grid` trains it, on every core."""
     steps: int = 4_000
-    """Steps of each; the replay saved is the main job's, of 12,000."""
     every: float = 2.0
-    """Seconds between checkpoints: far more of them than a run makes, so that their cost shows."""
     rounds: int = 5
-    """How often the cell is trained with and without, in turn."""
     json: Path | None = None
-    """File for the measurements."""
 
 
-class _Timed(Keeper):
+class _Timed(Checkpointer):
     """Notes how long training stood still for each checkpoint."""
 
     blocked: float = 0.0
     saved: int = 0
 
-    def visit(self, step, take):
+    def save_if_due(self, step, take):
         began = time.perf_counter()
         due = time.monotonic() >= self._due
-        super().visit(step, take)
+        super().save_if_due(step, take)
         self.blocked += time.perf_counter() - began
         self.saved += due
 
@@ -81,14 +85,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def measure(options: Options, compiled: Programs) -> dict[str, object]:
+def measure(options: Options, compiled: CompiledMethod) -> dict[str, object]:
     """Train the cell with and without, in turn.
 
     Raises:
         UserError: if it trains for less time than one checkpoint takes to fall due.
     """
 
-    def seconds(keeper: Keeper | None) -> float:
+    def seconds(checkpointer: Checkpointer | None) -> float:
         began = time.perf_counter()
         cell_lib.train(
             compiled,
@@ -99,17 +103,17 @@ def measure(options: Options, compiled: Programs) -> dict[str, object]:
             budget=Budget(options.steps, None, 250, 10),
             threshold=0.0,
             report=lambda progress: None,
-            keeper=keeper,
+            checkpointer=checkpointer,
         )
-        if keeper is not None:
-            keeper.wait()
+        if checkpointer is not None:
+            checkpointer.wait()
         return time.perf_counter() - began
 
     seconds(None)
-    ratios, keepers = [], []
+    ratios, checkpointers = [], []
     with tempfile.TemporaryDirectory() as folder:
         for number in range(options.rounds):
-            keeper = _Timed(
+            checkpointer = _Timed(
                 Path(folder) / str(number),
                 {},
                 every=options.every,
@@ -117,15 +121,17 @@ def measure(options: Options, compiled: Programs) -> dict[str, object]:
                 say=lambda line: print(line, file=sys.stderr),
             )
             without = seconds(None)
-            ratios.append(seconds(keeper) / without)
-            if not keeper.saved:
+            ratios.append(seconds(checkpointer) / without)
+            if not checkpointer.saved:
                 raise UserError(
                     f"--every: none was due in {without:.1f} s of training; ask for more --steps"
                 )
-            keepers.append(keeper)
-            size = sum(path.stat().st_size for path in keeper.folder.rglob("*") if path.is_file())
-            kept = len(list(keeper.folder.iterdir()))
-    count = sum(keeper.saved for keeper in keepers)
+            checkpointers.append(checkpointer)
+            size = sum(
+                path.stat().st_size for path in checkpointer.folder.rglob("*") if path.is_file()
+            )
+            kept = len(list(checkpointer.folder.iterdir()))
+    count = sum(checkpointer.saved for checkpointer in checkpointers)
     cost = statistics.median(ratios) - 1.0
     return {
         "seeds": options.seeds,
@@ -135,7 +141,7 @@ def measure(options: Options, compiled: Programs) -> dict[str, object]:
         "checkpoints": count,
         "checkpoint_bytes": size // kept,
         "kept": checkpoints.KEPT,
-        "blocked_seconds": sum(keeper.blocked for keeper in keepers) / count,
+        "blocked_seconds": sum(checkpointer.blocked for checkpointer in checkpointers) / count,
         "cost": cost,
         "cost_low": min(ratios) - 1.0,
         "cost_high": max(ratios) - 1.0,

@@ -13,10 +13,10 @@ from cmedirl_jax.agents.hot_start import HotStartHParams
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
 from cmedirl_jax.networks import Architecture
-from cmedirl_jax.runs.cells import compiled as programs_lib
+from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
-from cmedirl_jax.runs.cells.compiled import Programs
-from cmedirl_jax.runs.cells.slots import Lanes
+from cmedirl_jax.runs.cells.compiled import CompiledMethod
+from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.training import seeds
 from cmedirl_jax.training.methods import METHODS, RewardNetworkSettings, Settings
 from cmedirl_jax.training.schedules import RewardSchedule, Schedule
@@ -49,11 +49,11 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         subset_size=workload.n_demos,
     )
     data = hot_start.data(pool) if METHODS[workload.method].uses_demonstrations else None
-    lanes = Lanes(programs.lanes, workload.seeds, programs.group, programs.devices)
-    state = programs_lib.begin(programs, lanes, jax.random.key(0), data, workload.n_demos)
+    slots = Slots(programs.slots, workload.seeds, programs.group, programs.devices)
+    state = compiled_lib.begin(programs, slots, jax.random.key(0), data, workload.n_demos)
     running = np.arange(workload.seeds) < round(workload.running * workload.seeds)
     active = np.random.default_rng(0).permutation(running)
-    state, groups = programs_lib.pack(programs, lanes, state, active)
+    state, groups = compiled_lib.pack(programs, slots, state, active)
     taken = 0
 
     def advance(steps: int) -> None:
@@ -74,16 +74,16 @@ def compile_programs(
     seeds_count: int,
     group: int | None = None,
     subset_size: int | None = None,
-) -> Programs:
+) -> CompiledMethod:
     """One method's programs, with the main job's replay; `group` None for the library's choice."""
     env, architecture = envs.make("MountainCarContinuous-v0"), settings.architecture
     group = group or seeds.group_size(seeds_count, len(devices), architecture.hidden)
-    return programs_lib.compile_method(
+    return compiled_lib.compile_method(
         env,
         METHODS[method],
         settings,
         evaluator_lib.of_networks(env, architecture, group, devices),
-        programs_lib.compile_networks(env, architecture, group, devices),
+        compiled_lib.compile_networks(env, architecture, group, devices),
         group=group,
         seeds_count=seeds_count,
         devices=devices,

@@ -82,16 +82,19 @@ PEERS = (
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Whom to compare with, and where to write it."""
+    """Whom to compare with, and where to write it.
+
+    Attributes:
+        peers: Which peers.
+        rounds: How often each is timed.
+        environments: Folder of the peers' environments.
+        json: File for the measurements.
+    """
 
     peers: tuple[str, ...] = tuple(peer.module for peer in PEERS)
-    """Which peers."""
     rounds: int = 7
-    """How often each is timed."""
     environments: Path = platformdirs.user_cache_path("cmedirl_jax", appauthor=False) / "peers"
-    """Folder of the peers' environments."""
     json: Path | None = None
-    """File for the measurements."""
 
 
 def environment(name: str, requirements: Sequence[str], folder: Path) -> Path:

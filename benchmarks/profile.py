@@ -30,14 +30,17 @@ STEPS = 250
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What to profile."""
+    """What to profile.
+
+    Attributes:
+        group: Seeds of the group.
+        hidden: Units of each hidden layer.
+        layer_norm: Layer normalisation in the critic.
+    """
 
     group: int = 10
-    """Seeds of the group."""
     hidden: tuple[int, ...] = (64, 64)
-    """Units of each hidden layer."""
     layer_norm: bool = False
-    """Layer normalisation in the critic."""
 
 
 def kinds(program: str) -> dict[str, str]:

@@ -23,8 +23,8 @@ import tyro
 
 from benchmarks import measuring, ours
 from cmedirl_jax.runs.cells import cell as cell_lib
-from cmedirl_jax.runs.cells import compiled as programs_lib
-from cmedirl_jax.runs.cells.slots import Lanes
+from cmedirl_jax.runs.cells import compiled as compiled_lib
+from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.runs.cluster import exchange
 from cmedirl_jax.training import seeds
 from cmedirl_jax.training.methods import Settings
@@ -39,16 +39,19 @@ EXTRA_FLOATS = (2**12, 2**14, 2**16)
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What to measure, and where to write it."""
+    """What to measure, and where to write it.
+
+    Attributes:
+        method: A method without demonstrations.
+        seeds: Seeds that the groups share.
+        rounds: Turns of each group.
+        json: File for the measurements.
+    """
 
     method: str = "ddpg"
-    """A method without demonstrations."""
     seeds: int = 100
-    """Seeds that the groups share."""
     rounds: int = 7
-    """Turns of each group."""
     json: Path | None = None
-    """File for the measurements."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -128,12 +131,12 @@ def work(
     spread_over = exchange.devices(devices, seeds_count)
     exchange.connect(spread_over)
     programs = ours.compile_programs(method, Settings(), spread_over, seeds_count=seeds_count)
-    lanes = Lanes(programs.lanes, seeds_count, programs.group, programs.devices)
-    state = programs_lib.begin(programs, lanes, jax.random.key(0), None, 0)
-    groups = lanes.groups(np.ones(seeds_count, bool))
+    slots = Slots(programs.slots, seeds_count, programs.group, programs.devices)
+    state = compiled_lib.begin(programs, slots, jax.random.key(0), None, 0)
+    groups = slots.groups(np.ones(seeds_count, bool))
     split = seeds.sharding(spread_over)
     extra = [
-        jax.jit(lambda n=n: jnp.zeros((programs.lanes, n)), out_shardings=split)()
+        jax.jit(lambda n=n: jnp.zeros((programs.slots, n)), out_shardings=split)()
         for n in (EXTRA_FLOATS if processes > 1 else ())
     ]
     begun, warm = 0, False

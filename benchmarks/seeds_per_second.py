@@ -28,21 +28,24 @@ WIDTHS = ((64, 64), (128, 128), (400, 300))
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What to measure, and where to write it."""
+    """What to measure, and where to write it.
+
+    Attributes:
+        quick: DDPG at 100 seeds alone, on one device and on all: within a minute.
+        suites: Only these parts of the whole: seeds, width, batch, method, scale, devices, ended,
+            demonstrations, group, compilation.
+        methods: Only these methods.
+        devices: Devices of the workloads that use several; default: every core, or every GPU.
+        rounds: How often each workload is timed; default 5, with --quick 3.
+        json: File for the measurements; a plot is drawn beside it.
+    """
 
     quick: bool = False
-    """DDPG at 100 seeds alone, on one device and on all: within a minute."""
     suites: tuple[str, ...] = ()
-    """Only these parts of the whole: seeds, width, batch, method, scale, devices, ended,
-    demonstrations, group, compilation."""
     methods: tuple[str, ...] = PAPER_METHODS
-    """Only these methods."""
     devices: int | None = None
-    """Devices of the workloads that use several; default: every core, or every GPU."""
     rounds: int | None = None
-    """How often each workload is timed; default 5, with --quick 3."""
     json: Path | None = None
-    """File for the measurements; a plot is drawn beside it."""
 
 
 class Suite(NamedTuple):

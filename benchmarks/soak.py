@@ -19,14 +19,18 @@ from benchmarks import measuring, plots
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How much to run, and where to write what was seen."""
+    """How much to run, and where to write what was seen.
+
+    Attributes:
+        cells: Cells one after the other: HS-ME-DDPG, smoke preset, with 1, 2, 3, ...
+            demonstrations.
+        seeds: Seeds of each cell.
+        json: File for the measurements; a plot is drawn beside it.
+    """
 
     cells: int = 20
-    """Cells one after the other: HS-ME-DDPG, smoke preset, with 1, 2, 3, ... demonstrations."""
     seeds: int = 100
-    """Seeds of each cell."""
     json: Path | None = None
-    """File for the measurements; a plot is drawn beside it."""
 
 
 class Sample(NamedTuple):

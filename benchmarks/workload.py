@@ -9,25 +9,28 @@ CAPACITY = 12_000
 
 @dataclasses.dataclass(frozen=True)
 class Workload:
-    """A training loop to time. The defaults are the sizes that the project's targets name."""
+    """A training loop to time. The defaults are the sizes that the project's targets name.
+
+    Attributes:
+        variant: The library's training loop, or the plain reference.
+        method: One of `METHODS`.
+        seeds: Independent learners.
+        hidden: Units of each hidden layer of every network.
+        batch: Transitions per update.
+        layer_norm: Layer normalisation in the critic.
+        devices: 1: one device on one core; more: so many devices on all cores.
+        n_demos: Demonstrated trajectories per learner.
+        group: Seeds vmapped together; None: the library's choice.
+        running: Share of the seeds that have not ended.
+    """
 
     variant: Literal["ours", "naive"] = "ours"
-    """The library's training loop, or the plain reference."""
     method: str = "ddpg"
-    """One of `METHODS`."""
     seeds: int = 100
-    """Independent learners."""
     hidden: tuple[int, ...] = (64, 64)
-    """Units of each hidden layer of every network."""
     batch: int = 32
-    """Transitions per update."""
     layer_norm: bool = False
-    """Layer normalisation in the critic."""
     devices: int = 1
-    """1: one device on one core; more: so many devices on all cores."""
     n_demos: int = 10
-    """Demonstrated trajectories per learner."""
     group: int | None = None
-    """Seeds vmapped together; None: the library's choice."""
     running: float = 1.0
-    """Share of the seeds that have not ended."""

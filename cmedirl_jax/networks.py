@@ -40,20 +40,24 @@ class ActorCritic(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Architecture:
-    """Sizes and switches of the actor and the critic. All static."""
+    """Sizes and switches of the actor and the critic. All static.
+
+    Attributes:
+        hidden: Units of each hidden layer, for the actor and the critic alike.
+        actor_normalisation: Normalisation of the actor's hidden layers (before the ReLU).
+        critic_normalisation: Normalisation of the critic's hidden layers (before the ReLU).
+        normalise_observation: Map the observation bounds to [-1, 1] at the input of each network.
+        action_layer: Layer of the critic at which the action joins (0: the input; Lillicrap et al.:
+            1).
+        output_scale: Half-width of the uniform initialisation of the last layer.
+    """
 
     hidden: tuple[int, ...] = (64, 64)
-    """Units of each hidden layer, for the actor and the critic alike."""
     actor_normalisation: Normalisation = "none"
-    """Normalisation of the actor's hidden layers (before the ReLU)."""
     critic_normalisation: Normalisation = "layer"
-    """Normalisation of the critic's hidden layers (before the ReLU)."""
     normalise_observation: bool = True
-    """Map the observation bounds to [-1, 1] at the input of each network."""
     action_layer: int = 0
-    """Layer of the critic at which the action joins (0: the input; Lillicrap et al.: 1)."""
     output_scale: float = 3e-3
-    """Half-width of the uniform initialisation of the last layer."""
 
 
 class MLP(nn.Module):

@@ -39,15 +39,18 @@ RESAMPLES = 9_999
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Which run, and against which of its cells."""
+    """Which run, and against which of its cells.
+
+    Attributes:
+        folder: A run's folder.
+        against: The method that every other is compared with, at the same number of demonstrations
+            where it has several.
+        out: A CSV file for the table.
+    """
 
     folder: Annotated[Path, tyro.conf.Positional]
-    """A run's folder."""
     against: str = "ddpg"
-    """The method that every other is compared with, at the same number of demonstrations where it
-    has several."""
     out: Path | None = None
-    """A CSV file for the table."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,9 +12,9 @@ from cmedirl_jax.runs.validation import Cell
 from experiments import figures
 
 
-def conclude(grid: StudyConfig, env: Env, plan: list[Cell], *, redraw: bool) -> pl.DataFrame:
+def conclude(config: StudyConfig, env: Env, plan: list[Cell], redraw: bool) -> pl.DataFrame:
     """Summarise the run's tables; draw its figures where they are not there yet."""
-    folder = grid.folder
+    folder = config.folder
     tables = sealing.read(folder)
     evaluations = tables["evaluations"]
 
@@ -29,7 +29,7 @@ def conclude(grid: StudyConfig, env: Env, plan: list[Cell], *, redraw: bool) -> 
                 of(evaluations, cell),
                 of(tables["seeds"], cell),
                 env.spec.reward_threshold,
-                grid.max_episodes,
+                config.max_episodes,
                 interacts=cell.method.interacts,
             )
             for cell in plan

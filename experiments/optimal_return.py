@@ -39,20 +39,23 @@ RANGES = {
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Which grids, which discount, and where to write it."""
+    """Which grids, which discount, and where to write it.
+
+    Attributes:
+        env: The environment, by Gymnasium's name.
+        states: Points along each dimension of the observation, a grid for each.
+        actions: Points along each dimension of the action.
+        discount: The agent's; the undiscounted optimum is found beside it.
+        starts: Start states, evenly spaced, as in the evaluations of `tuned`.
+        out: A CSV file for the table of all starts.
+    """
 
     env: str = "MountainCarContinuous-v0"
-    """The environment, by Gymnasium's name."""
     states: tuple[int, ...] = (101, 201, 401)
-    """Points along each dimension of the observation, a grid for each."""
     actions: int = 21
-    """Points along each dimension of the action."""
     discount: float = 0.99
-    """The agent's; the undiscounted optimum is found beside it."""
     starts: int = 10
-    """Start states, evenly spaced, as in the evaluations of `tuned`."""
     out: Path | None = None
-    """A CSV file for the table of all starts."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -14,13 +14,15 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from cmedirl_jax.envs import Env
 from cmedirl_jax.runs import heap
-from cmedirl_jax.runs import run as grid_lib
+from cmedirl_jax.runs import run as run_lib
 from cmedirl_jax.runs.cluster import exchange, processes
 from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.console import compile_cache, signals, streams
 from cmedirl_jax.runs.console.signals import Interrupted
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.validation import Cell
 from experiments.presets import PRESETS
 
 _STOPPING = "Stopping after this chunk of steps; once more to stop at once\n"
@@ -36,19 +38,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str]) -> int:
-    grid = parse(arguments)
+    config = parse(arguments)
     try:
-        processes.check(grid)
+        processes.check(config)
     except UserError as error:
         return _end(2, str(error))
-    if not processes.is_asked(grid):
-        return work(grid)
+    if not processes.is_asked(config):
+        return work(config)
     if not processes.is_worker():
-        return processes.supervise(arguments)
-    return processes.guarded(lambda: work(grid))
+        return processes.supervise("experiments.run_grid", arguments)
+    return processes.guarded("run_grid", lambda: work(config))
 
 
-def work(grid: StudyConfig) -> int:
+def work(config: StudyConfig) -> int:
     """Do the run, or this process's share of it; returns the exit code."""
     console = Console(file=streams.dispensable())
     if not console.is_terminal:
@@ -57,10 +59,10 @@ def work(grid: StudyConfig) -> int:
     compile_cache.use_cache()
     try:
         # Before anything else: the first array that JAX makes fixes the number of CPU devices.
-        devices = start_devices(grid)
+        devices = start_devices(config)
         console.quiet = not exchange.is_writer()
         with signals.noted(None if console.quiet else _STOPPING) as interruption:
-            summary = grid_lib.run(grid, devices, console, interruption)
+            summary = run_lib.run(config, devices, console, interruption, _conclude)
     except UserError as error:
         return _end(2, str(error))
     except Interrupted as error:
@@ -77,9 +79,16 @@ def work(grid: StudyConfig) -> int:
     if summary["diverged"].sum():
         console.print(f"Seeds that diverged and were stopped: {summary['diverged'].sum()}")
     console.print(
-        f"Tables and figures: {grid.folder}", markup=False, highlight=False, soft_wrap=True
+        f"Tables and figures: {config.folder}", markup=False, highlight=False, soft_wrap=True
     )
     return 0
+
+
+def _conclude(config: StudyConfig, env: Env, cells: list[Cell], redraw: bool) -> pl.DataFrame:
+    # Matplotlib and scipy take a second to import: a refusal does not wait for them.
+    from experiments import conclusion
+
+    return conclusion.conclude(config, env, cells, redraw)
 
 
 def _end(exit_code: int, line: str) -> int:
@@ -102,33 +111,33 @@ def parse(arguments: Sequence[str]) -> StudyConfig:
     )
 
 
-def start_devices(grid: StudyConfig) -> list[jax.Device]:
+def start_devices(config: StudyConfig) -> list[jax.Device]:
     """Start JAX with as many CPU devices as the run uses, or take the GPUs there are.
 
     Raises:
         UserError: if more devices are asked for than there are.
     """
     # A device wants a few seeds to itself: fewer than four a device do not fill a vector unit.
-    wanted = grid.devices or max(1, min(cores(), grid.seeds // 4))
-    if grid.devices is None or 1 <= grid.devices <= cores():
+    wanted = config.devices or max(1, min(cores(), config.seeds // 4))
+    if config.devices is None or 1 <= config.devices <= cores():
         # Once JAX has started (a second call in one process) it keeps the devices it has.
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", wanted)
-    if processes.is_asked(grid):
-        processes.join(grid)
+    if processes.is_asked(config):
+        processes.join(config)
     devices = jax.local_devices()
     available = len(devices) if devices[0].platform != "cpu" else cores()
-    refused = grid.devices is not None and grid.devices > available
+    refused = config.devices is not None and config.devices > available
     # Together: a process that left alone would keep the others waiting.
     if exchange.any_process(refused):
         there = f"there are {available}" if refused else "another process has fewer"
-        raise UserError(f"--devices: {grid.devices} asked, {there}")
-    if processes.is_asked(grid):
-        exchange.check_same(grid)
-        shared = exchange.devices(grid.devices, grid.seeds)
+        raise UserError(f"--devices: {config.devices} asked, {there}")
+    if processes.is_asked(config):
+        exchange.check_same(config)
+        shared = exchange.devices(config.devices, config.seeds)
         exchange.connect(shared)
         return shared
-    return devices[: max(grid.devices, 1)] if grid.devices is not None else devices
+    return devices[: max(config.devices, 1)] if config.devices is not None else devices
 
 
 def cores() -> int:

@@ -21,27 +21,33 @@ from cmedirl_jax.types import EnvSpec, Numeric, Params, Transition
 
 
 class DDPGHParams(flax.struct.PyTreeNode):
-    """Hyperparameters. The numbers are traced leaves of the state, to vmap over or to change."""
+    """Hyperparameters. The numbers are traced leaves of the state, to vmap over or to change.
+
+    Attributes:
+        discount: Discount of the return, gamma.
+        tau: Share of the online parameters in each target update; 1 copies them.
+        actor_learning_rate: Adam's rate for the actor.
+        critic_learning_rate: Adam's rate for the critic.
+        reward_scale: Factor on every reward the critic learns from.
+        pre_activation_penalty: Weight of the mean squared pre-activation in the actor's loss; keeps
+            tanh off its ends.
+        behaviour_cloning: Weight of the actor's squared error on the demonstrations passed to
+            `update`; the `tuned` preset sets 1.
+        q_filter: Clone only the actions that the critic values above the actor's own (Nair et al.
+            2018).
+        bootstrap_at_termination: Leave (1 - terminated) out of the target, as Algorithm 2 is
+            printed.
+    """
 
     discount: float = 0.99
-    """Discount of the return, gamma."""
     tau: float = 0.01
-    """Share of the online parameters in each target update; 1 copies them."""
     actor_learning_rate: float = 1e-4
-    """Adam's rate for the actor."""
     critic_learning_rate: float = 1e-3
-    """Adam's rate for the critic."""
     reward_scale: float = 1.0
-    """Factor on every reward the critic learns from."""
     pre_activation_penalty: float = 1e-3
-    """Weight of the mean squared pre-activation in the actor's loss; keeps tanh off its ends."""
     behaviour_cloning: float = 0.0
-    """Weight of the actor's squared error on the demonstrations passed to `update`; the `tuned`
-    preset sets 1."""
     q_filter: bool = flax.struct.field(pytree_node=False, default=False)
-    """Clone only the actions that the critic values above the actor's own (Nair et al. 2018)."""
     bootstrap_at_termination: bool = flax.struct.field(pytree_node=False, default=False)
-    """Leave (1 - terminated) out of the target, as Algorithm 2 is printed."""
 
 
 class DDPGState(flax.struct.PyTreeNode):

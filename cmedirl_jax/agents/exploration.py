@@ -65,35 +65,44 @@ class Exploration(NamedTuple):
 
 
 class GaussianHParams(flax.struct.PyTreeNode):
-    """Independent Gaussian noise."""
+    """Independent Gaussian noise.
+
+    Attributes:
+        scale: Standard deviation, in half-widths of the action range.
+    """
 
     scale: float = 0.5
-    """Standard deviation, in half-widths of the action range."""
 
 
 class OrnsteinUhlenbeckHParams(flax.struct.PyTreeNode):
-    """Ornstein-Uhlenbeck noise (Lillicrap et al. 2015), reset at each episode."""
+    """Ornstein-Uhlenbeck noise (Lillicrap et al. 2015), reset at each episode.
+
+    Attributes:
+        theta: Share of the noise that decays per step.
+        sigma: Standard deviation of the innovation, in half-widths of the action range.
+    """
 
     theta: float = 0.15
-    """Share of the noise that decays per step."""
     sigma: float = 0.5
-    """Standard deviation of the innovation, in half-widths of the action range."""
 
 
 class EpsilonGreedyHParams(flax.struct.PyTreeNode):
-    """Epsilon-greedy with a linear schedule (the paper, section 4.1)."""
+    """Epsilon-greedy with a linear schedule (the paper, section 4.1).
+
+    Attributes:
+        epsilon_start: Probability that a random action begins, at step 0.
+        epsilon_end: Probability that a random action begins, from `epsilon_steps` on.
+        epsilon_steps: Environment steps over which epsilon falls linearly.
+        hold: Steps for which a random action is held (1: the paper's letter).
+        noise: Standard deviation of Gaussian noise on mu(s), in half-widths of the action range.
+            None for none, as in the paper; that is static, a number is not.
+    """
 
     epsilon_start: float = 1.0
-    """Probability that a random action begins, at step 0."""
     epsilon_end: float = 0.01
-    """Probability that a random action begins, from `epsilon_steps` on."""
     epsilon_steps: float = 5000.0
-    """Environment steps over which epsilon falls linearly."""
     hold: float = 1.0
-    """Steps for which a random action is held (1: the paper's letter)."""
     noise: float | None = None
-    """Standard deviation of Gaussian noise on mu(s), in half-widths of the action range. None for
-    none, as in the paper; that is static, a number is not."""
 
 
 class OrnsteinUhlenbeckState(flax.struct.PyTreeNode):

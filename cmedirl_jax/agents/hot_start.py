@@ -32,24 +32,27 @@ from cmedirl_jax.types import Array, EnvSpec, Params, Transition
 
 
 class HotStartHParams(flax.struct.PyTreeNode):
-    """Hyperparameters; the strings and sizes are static."""
+    """Hyperparameters; the strings and sizes are static.
+
+    Attributes:
+        learning_rate: Adam's rate for both networks.
+        curvature: Of the "quadratic" critic target, per squared half-width of the action range.
+        margin: Of the "large-margin" loss: by how much the demonstrated action's value is to lead.
+        critic: The critic's loss: H0 to H4, see the module's docstring.
+        cells: Evenly spaced values per action dimension, bounds included; K = cells^A actions.
+        steps: Gradient steps on each network.
+        batch_size: Demonstrated steps per gradient step.
+    """
 
     learning_rate: float = 1e-3
-    """Adam's rate for both networks."""
     curvature: float = 20.0
-    """Of the "quadratic" critic target, per squared half-width of the action range."""
     margin: float = 0.8
-    """Of the "large-margin" loss: by how much the demonstrated action's value is to lead."""
     critic: Literal["softmax", "one-hot", "quadratic", "monte-carlo", "large-margin"] = (
         flax.struct.field(pytree_node=False, default="one-hot")
     )
-    """The critic's loss: H0 to H4, see the module's docstring."""
     cells: int = flax.struct.field(pytree_node=False, default=11)
-    """Evenly spaced values per action dimension, bounds included; K = cells^A actions."""
     steps: int = flax.struct.field(pytree_node=False, default=1000)
-    """Gradient steps on each network."""
     batch_size: int = flax.struct.field(pytree_node=False, default=32)
-    """Demonstrated steps per gradient step."""
 
 
 class HotStartData(NamedTuple):

@@ -20,18 +20,22 @@ from cmedirl_jax.types import EnvSpec, Network, Params, RewardBatch, Transition
 
 
 class GAILHParams(flax.struct.PyTreeNode):
-    """Hyperparameters. The numbers are traced leaves of the state."""
+    """Hyperparameters. The numbers are traced leaves of the state.
+
+    Attributes:
+        learning_rate: Adam's rate for the discriminator.
+        scale: Factor on the reward.
+        output_penalty: Weight of the mean squared f(s, a) against the log-likelihood.
+        form: The reward: above zero, where living on pays; below zero, where ending does; or
+            either.
+    """
 
     learning_rate: float = 1e-3
-    """Adam's rate for the discriminator."""
     scale: float = 0.1
-    """Factor on the reward."""
     output_penalty: float = 0.05
-    """Weight of the mean squared f(s, a) against the log-likelihood."""
     form: Literal["-log(1 - D)", "log D", "logit D"] = flax.struct.field(
         pytree_node=False, default="-log(1 - D)"
     )
-    """The reward: above zero, where living on pays; below zero, where ending does; or either."""
 
 
 def make(

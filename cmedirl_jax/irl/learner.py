@@ -24,41 +24,50 @@ from cmedirl_jax.types import EnvSpec, Network, Numeric, Params, RewardBatch, Tr
 
 
 class IRLHParams(flax.struct.PyTreeNode):
-    """Hyperparameters. The numbers are traced leaves of the state."""
+    """Hyperparameters. The numbers are traced leaves of the state.
+
+    Attributes:
+        learning_rate: Adam's rate for the reward network.
+        bound: Largest magnitude of r_D, before any gauge.
+        output_penalty: Weight of the mean squared f(s, a) against the log-likelihood, and of the
+            absorbing state's f^2; keeps tanh off its ends.
+        prior_precision: Precision lambda of the Gaussian prior, log P(theta) = -lambda/2
+            ||theta||^2 (Eq. 4).
+        gradient_penalty: Weight of the squared gradient of f at points between demonstrations and
+            background, by inputs in half-widths of their ranges; None: no such term, nor its cost.
+        gradient_penalty_target: Norm of the gradient that is not penalised (Gulrajani et al. 2017:
+            1).
+        gauge_rate: Share of the gauge's offset that each update moves to that of its batch.
+        discount: Discount of a trajectory's return; only 1 makes its optimum that of
+            `tabular.maxent`.
+        weight_exponent: Exponent of importance weights: 1 as they are, 0 uniform.
+        weight_limit: Largest distance of an importance weight's logarithm from the samples' mean;
+            None: any.
+        objective: How E[mu] is estimated, see `irl.objectives`; the last takes trajectories.
+        bounded_by: r_D = bound * tanh(f), f clipped to +-bound, or f itself.
+        gauge: Constant taken off r_D: none, its background mean, or the demonstrations' largest.
+        absorbing: Learn the reward of an absorbing state after termination (Kostrikov et al. 2019).
+            Of pairs, one more sample follows each termination; of trajectories, the rest of the
+            time limit.
+        append_demonstrations: Append the demonstration batch to the background batch (Algorithm 1,
+            line 4).
+    """
 
     learning_rate: float = 1e-3
-    """Adam's rate for the reward network."""
     bound: float = 0.1
-    """Largest magnitude of r_D, before any gauge."""
     output_penalty: float = 0.05
-    """Weight of the mean squared f(s, a) against the log-likelihood, and of the absorbing state's
-    f^2; keeps tanh off its ends."""
     prior_precision: float = 0.0
-    """Precision lambda of the Gaussian prior, log P(theta) = -lambda/2 ||theta||^2 (Eq. 4)."""
     gradient_penalty: float | None = None
-    """Weight of the squared gradient of f at points between demonstrations and background, by
-    inputs in half-widths of their ranges; None: no such term, nor its cost."""
     gradient_penalty_target: float = 0.0
-    """Norm of the gradient that is not penalised (Gulrajani et al. 2017: 1)."""
     gauge_rate: float = 0.05
-    """Share of the gauge's offset that each update moves to that of its batch."""
     discount: float = 1.0
-    """Discount of a trajectory's return; only 1 makes its optimum that of `tabular.maxent`."""
     weight_exponent: float = 1.0
-    """Exponent of importance weights: 1 as they are, 0 uniform."""
     weight_limit: float | None = None
-    """Largest distance of an importance weight's logarithm from the samples' mean; None: any."""
     objective: Objective = flax.struct.field(pytree_node=False, default="visitation")
-    """How E[mu] is estimated, see `irl.objectives`; the last takes trajectories."""
     bounded_by: BoundKind = flax.struct.field(pytree_node=False, default="tanh")
-    """r_D = bound * tanh(f), f clipped to +-bound, or f itself."""
     gauge: Gauge = flax.struct.field(pytree_node=False, default="none")
-    """Constant taken off r_D: none, its background mean, or the demonstrations' largest."""
     absorbing: bool = flax.struct.field(pytree_node=False, default=False)
-    """Learn the reward of an absorbing state after termination (Kostrikov et al. 2019). Of pairs,
-    one more sample follows each termination; of trajectories, the rest of the time limit."""
     append_demonstrations: bool = flax.struct.field(pytree_node=False, default=True)
-    """Append the demonstration batch to the background batch (Algorithm 1, line 4)."""
 
 
 class RewardParams(NamedTuple):

@@ -25,26 +25,32 @@ from cmedirl_jax.types import EnvSpec, Params, RewardBatch, Transition
 
 @dataclasses.dataclass(frozen=True)
 class RewardBatchSettings:
-    """Which samples the reward learns from. All static."""
+    """Which samples the reward learns from. All static.
+
+    Attributes:
+        batch_size: Demonstrated pairs per update, and background pairs per update.
+        recent: Background: the latest transitions of the replay, or the episodes that lie in them;
+            None: all collected so far.
+        weights: Weights of the samples of "maxent": all alike, 1 / the density recorded when the
+            action was drawn, or 1 / the mixture of snapshots of the policy and, where
+            demonstrations are appended, of their fitted Gaussian, in the same shares everywhere.
+        snapshots: Snapshots of the policy in the mixture, the latest ones; they must reach back as
+            `recent`.
+        snapshot_period: Environment steps between snapshots.
+        trajectories: Demonstrated trajectories per update of the "trajectory" objective, and as
+            many of the background. An update costs their steps, up to the time limit of each: take
+            a long `period`.
+        episodes: Episodes of the background, the latest ones, that trajectories are drawn from at
+            most.
+    """
 
     batch_size: int = 32
-    """Demonstrated pairs per update, and background pairs per update."""
     recent: int | None = 2000
-    """Background: the latest transitions of the replay, or the episodes that lie in them; None:
-    all collected so far."""
     weights: Literal["uniform", "recorded", "fusion"] = "uniform"
-    """Weights of the samples of "maxent": all alike, 1 / the density recorded when the action was
-    drawn, or 1 / the mixture of snapshots of the policy and, where demonstrations are appended, of
-    their fitted Gaussian, in the same shares everywhere."""
     snapshots: int = 8
-    """Snapshots of the policy in the mixture, the latest ones; they must reach back as `recent`."""
     snapshot_period: int = 250
-    """Environment steps between snapshots."""
     trajectories: int = 8
-    """Demonstrated trajectories per update of the "trajectory" objective, and as many of the
-    background. An update costs their steps, up to the time limit of each: take a long `period`."""
     episodes: int = 32
-    """Episodes of the background, the latest ones, that trajectories are drawn from at most."""
 
 
 class SamplerState(flax.struct.PyTreeNode):

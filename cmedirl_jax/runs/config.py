@@ -14,65 +14,79 @@ Expert = Literal["best", "median", "all"]
 
 @dataclasses.dataclass(frozen=True)
 class ExpertSettings:
-    """How the demonstrations are made: by DDPG on the true reward, with the `tuned` settings."""
+    """How the demonstrations are made: by DDPG on the true reward, with the `tuned` settings.
+
+    Attributes:
+        seeds: Experts trained; the final policies of those that solve the task can demonstrate.
+        steps: Environment steps of each expert.
+        trajectories: Least number of demonstrated trajectories in the pool.
+    """
 
     seeds: int = 16
-    """Experts trained; the final policies of those that solve the task can demonstrate."""
     steps: int = 14_000
-    """Environment steps of each expert."""
     trajectories: int = 1_024
-    """Least number of demonstrated trajectories in the pool."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StudyConfig:
-    """A run: methods x numbers of demonstrations x seeds, a learner's budget, its settings."""
+    """A run: methods x numbers of demonstrations x seeds, a learner's budget, its settings.
+
+    Attributes:
+        preset: tuned: the setting that works; paper: the paper's letter; smoke: ends within a
+            minute.
+        methods: Which methods to train.
+        n_demos: Demonstrated trajectories N_T per learner; several make Figures 4 and 5.
+        seeds: Independent learners per cell.
+        seed: Seed of the whole study.
+        max_steps: Environment steps per learner.
+        max_episodes: Episodes per learner; with max-steps, whichever comes first.
+        evaluate_every: Environment steps between noise-free evaluations.
+        evaluation_starts: Start states per evaluation, evenly spaced, the same for every seed and
+            method.
+        evaluate_every_episodes: Also evaluate each learner whenever it has lived this many more
+            episodes (the paper: 100).
+        evaluation_starts_episodes: Start states of the evaluations by episodes.
+        out: Folder of the results; default results/PRESET.
+        expert: Who demonstrates: the best or median expert that solved the task, or all of them
+            alike.
+        demos: A demonstrations file to learn from; no experts are trained, their options say
+            nothing.
+        env: The environment, by Gymnasium's name.
+        devices: CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU.
+            With several processes, of each of them.
+        group: Seeds that a device steps together; default: what is fastest for the networks' width.
+        distributed: Share the run with the other processes of the cluster that JAX detects
+            (docs/scaling.md).
+        coordinator: Share the run with other processes: HOST:PORT of process 0, the same for all of
+            them.
+        processes: With coordinator: how many processes there are.
+        process_id: With coordinator: which of them this is, from 0; process 0 alone writes results.
+        checkpoint_every: Seconds from one checkpoint of the training to the next; 0: one after
+            every chunk.
+    """
 
     preset: Literal["tuned", "paper", "smoke"] = "tuned"
-    """tuned: the setting that works; paper: the paper's letter; smoke: ends within a minute."""
     methods: tuple[str, ...] = PAPER_METHODS
-    """Which methods to train."""
     n_demos: tuple[int, ...] = (200,)
-    """Demonstrated trajectories N_T per learner; several make Figures 4 and 5."""
     seeds: int = 100
-    """Independent learners per cell."""
     seed: int = 0
-    """Seed of the whole study."""
     max_steps: int | None = 12_000
-    """Environment steps per learner."""
     max_episodes: int | None = None
-    """Episodes per learner; with max-steps, whichever comes first."""
     evaluate_every: int = 250
-    """Environment steps between noise-free evaluations."""
     evaluation_starts: int = 10
-    """Start states per evaluation, evenly spaced, the same for every seed and method."""
     evaluate_every_episodes: int | None = None
-    """Also evaluate each learner whenever it has lived this many more episodes (the paper: 100)."""
     evaluation_starts_episodes: int = 100
-    """Start states of the evaluations by episodes."""
     out: Path | None = None
-    """Folder of the results; default results/PRESET."""
     expert: Expert = "best"
-    """Who demonstrates: the best or median expert that solved the task, or all of them alike."""
     demos: Path | None = None
-    """A demonstrations file to learn from; no experts are trained, their options say nothing."""
     env: str = "MountainCarContinuous-v0"
-    """The environment, by Gymnasium's name."""
     devices: int | None = None
-    """CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU. With
-    several processes, of each of them."""
     group: int | None = None
-    """Seeds that a device steps together; default: what is fastest for the networks' width."""
     distributed: bool = False
-    """Share the run with the other processes of the cluster that JAX detects (docs/scaling.md)."""
     coordinator: str | None = None
-    """Share the run with other processes: HOST:PORT of process 0, the same for all of them."""
     processes: int | None = None
-    """With coordinator: how many processes there are."""
     process_id: int | None = None
-    """With coordinator: which of them this is, from 0; process 0 alone writes results."""
     checkpoint_every: float = 60.0
-    """Seconds from one checkpoint of the training to the next; 0: one after every chunk."""
     experts: ExpertSettings = ExpertSettings()
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
 

@@ -22,10 +22,10 @@ from cmedirl_jax.envs import Env
 from cmedirl_jax.io import checkpoint
 from cmedirl_jax.runs import validation
 from cmedirl_jax.runs.cells import cell as cell_lib
-from cmedirl_jax.runs.cells import compiled as programs_lib
+from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells import experts, gymnasium_replay, tabular_cell
-from cmedirl_jax.runs.cells.compiled import Programs
+from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.cluster import exchange, orbax_worker
 from cmedirl_jax.runs.config import StudyConfig
@@ -36,12 +36,12 @@ from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import sealing, tables
-from cmedirl_jax.runs.storage.checkpoints import Keeper
+from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.runs.validation import Cell
 from cmedirl_jax.training.methods import METHODS, Method, Settings
 
 FRESH_STARTS = 100
-"""Random start states on which each seed's best policy is judged at the end."""
+"""Random start states on which each seed's best policy is evaluated at the end."""
 
 
 class Keys(NamedTuple):
@@ -55,7 +55,7 @@ class Keys(NamedTuple):
 class _Session(NamedTuple):
     """What a run is given once and its parts share."""
 
-    grid: StudyConfig
+    config: StudyConfig
     env: Env
     budget: Budget
     keys: Keys
@@ -64,12 +64,12 @@ class _Session(NamedTuple):
     interruption: Interruption
     identity: dict[str, Any]
 
-    def keeper(self, name: str) -> Keeper:
+    def checkpointer(self, name: str) -> Checkpointer:
         """What saves the training that is called `name`."""
-        return Keeper(
-            self.grid.folder / "checkpoints" / name,
+        return Checkpointer(
+            self.config.folder / "checkpoints" / name,
             self.identity,
-            every=self.grid.checkpoint_every,
+            every=self.config.checkpoint_every,
             interruption=self.interruption,
             say=functools.partial(
                 self.console.print, markup=False, highlight=False, soft_wrap=True
@@ -78,35 +78,51 @@ class _Session(NamedTuple):
 
 
 class _Compiled(NamedTuple):
-    """Programs by method, each compiled once."""
+    """What is compiled once for each method."""
 
-    method: Callable[[Method, Settings], Programs]
-    tabular: Callable[[Method], tabular_cell.Programs]
+    method: Callable[[Method, Settings], CompiledMethod]
+    tabular: Callable[[Method], tabular_cell.CompiledFit]
 
 
 def run(
-    grid: StudyConfig, devices: list[jax.Device], console: Console, interruption: Interruption
+    config: StudyConfig,
+    devices: list[jax.Device],
+    console: Console,
+    interruption: Interruption,
+    conclude: Callable[[StudyConfig, Env, list[Cell], bool], pl.DataFrame],
 ) -> pl.DataFrame | None:
-    """Do what is left of a run; returns its summary, of several processes on process 0 alone.
+    """Train the cells that are missing, then conclude.
+
+    Args:
+        config: the run.
+        devices: that share the seeds.
+        console: where progress goes.
+        interruption: the signals that have come.
+        conclude: called last, on process 0 alone, with the configuration, the environment, the
+            run's cells, and whether any was trained just now. It reads the tables and summarises
+            them. It is called again at the next start if a signal ends it.
+
+    Returns:
+        What `conclude` returned; None on the other processes.
 
     Raises:
         UserError: for a configuration, a folder or a file that cannot work.
         Interrupted: if a signal came; what was reached is saved.
         OSError: if a file could not be written; what was finished stays.
     """
-    validation.check(grid)
-    env = envs.make(grid.env)
+    validation.check(config)
+    env = envs.make(config.env)
     given = None
-    if grid.demos is not None:
-        given = exchange.pool_from_writer(lambda: validation.load_demonstrations(grid, env))
-    plan = validation.cells_of(grid)
+    if config.demos is not None:
+        given = exchange.pool_from_writer(lambda: validation.load_demonstrations(config, env))
+    plan = validation.cells_of(config)
     with contextlib.ExitStack() as stack:
 
         def enter() -> dict[str, Any]:
-            folder = stack.enter_context(run_folder.opened(grid))
+            folder = stack.enter_context(run_folder.opened(config))
             return {
                 "finished": [list(cell) for cell in sealing.finished(folder)],
-                "identity": run_folder.identity(grid),
+                "identity": run_folder.identity(config),
                 "began": run_folder.other_versions(folder),
             }
 
@@ -114,20 +130,20 @@ def run(
         todo = [cell for cell in plan if [cell.method.name, cell.n_demos] not in found["finished"]]
         if todo:
             kind = devices[0].platform.upper()
-            console.print(f"{grid.seeds} seeds per cell on {len(devices)} {kind} device(s)")
+            console.print(f"{config.seeds} seeds per cell on {len(devices)} {kind} device(s)")
             for name, version in found["began"].items():
                 console.print(f"This run was begun with {name} {version}", highlight=False)
             session = _Session(
-                grid,
+                config,
                 env,
-                validation.budget_of(grid, env),
-                Keys(*jax.random.split(jax.random.key(grid.seed), 3)),
+                validation.budget_of(config, env),
+                Keys(*jax.random.split(jax.random.key(config.seed), 3)),
                 devices,
                 console,
                 interruption,
                 found["identity"],
             )
-            with compile_cache.counted() as cost, _within_memory(grid.folder):
+            with compile_cache.counted() as cost, _within_memory(config.folder):
                 _train_cells(session, given, todo)
             console.print(
                 f"Compilation took {cost.seconds:.1f} s; {cost.hits} programs came from the cache, "
@@ -138,13 +154,9 @@ def run(
             interruption.stop()
         if not exchange.is_writer():
             return None
-        # What follows is done again at the next start if a signal ends it.
         interruption.release()
-        shutil.rmtree(grid.folder / "checkpoints", ignore_errors=True)
-        # Matplotlib and scipy take a second to import, which a refusal need not wait for.
-        from experiments import conclusion
-
-        return conclusion.conclude(grid, env, plan, redraw=bool(todo))
+        shutil.rmtree(config.folder / "checkpoints", ignore_errors=True)
+        return conclude(config, env, plan, bool(todo))
 
 
 @contextlib.contextmanager
@@ -165,85 +177,87 @@ def _within_memory(folder: Path) -> Iterator[None]:
 
 
 def _train_cells(session: _Session, given: Demonstrations | None, todo: list[Cell]) -> None:
-    grid, env, budget = session.grid, session.env, session.budget
-    kept = exchange.pool_from_writer(lambda: stored_demonstrations.load(grid.folder, env))
+    config, env, budget = session.config, session.env, session.budget
+    kept = exchange.pool_from_writer(lambda: stored_demonstrations.load(config.folder, env))
     pool = kept if given is None else given
     trains_experts = pool is None and any(cell.n_demos for cell in todo)
-    learners = grid.seeds * sum(cell.method.interacts for cell in todo)
-    total = learners * budget.max_steps + grid.experts.seeds * grid.experts.steps * trains_experts
+    learners = config.seeds * sum(cell.method.interacts for cell in todo)
+    total = (
+        learners * budget.max_steps + config.experts.seeds * config.experts.steps * trains_experts
+    )
     compiled = _Compiled(
-        programs_lib.compiler(grid, env, budget, session.devices),
+        compiled_lib.compiler(config, env, budget, session.devices),
         functools.cache(
             functools.partial(
                 tabular_cell.compile_method,
                 env,
-                settings=grid.settings,
+                settings=config.settings,
                 devices=session.devices,
-                subset_size=max(grid.n_demos),
+                subset_size=max(config.n_demos),
             )
         ),
     )
     with reporter(session.console, len(todo) + trains_experts, total) as report:
         if trains_experts:
-            report.start(f"experts, {grid.experts.seeds} seeds")
-            with session.keeper("experts") as keeper:
-                pool = _train_experts(session, compiled, keeper, report)
+            report.start(f"experts, {config.experts.seeds} seeds")
+            with session.checkpointer("experts") as checkpointer:
+                pool = _train_experts(session, compiled, checkpointer, report)
         data, metadata = None, {}
         if pool is not None:
-            validation.check_enough(grid, int(pool.episode[-1]) + 1)
-            agent = grid.settings.agent
+            validation.check_enough(config, int(pool.episode[-1]) + 1)
+            agent = config.settings.agent
             data = hot_start.data(pool, agent.discount, agent.reward_scale)
             metadata = pool.metadata
         if pool is not None and exchange.is_writer():
             if kept is None:
-                stored_demonstrations.save(grid.folder, pool)
-            shutil.rmtree(grid.folder / "checkpoints" / "experts", ignore_errors=True)
+                stored_demonstrations.save(config.folder, pool)
+            shutil.rmtree(config.folder / "checkpoints" / "experts", ignore_errors=True)
         for cell in todo:
             if session.interruption.came():
                 session.interruption.stop()
-            report.start(f"{cell.name}, {grid.seeds} seeds")
-            with session.keeper(cell.name) as keeper:
-                _train_cell(session, compiled, keeper, cell, data, metadata, report)
+            report.start(f"{cell.name}, {config.seeds} seeds")
+            with session.checkpointer(cell.name) as checkpointer:
+                _train_cell(session, compiled, checkpointer, cell, data, metadata, report)
 
 
 def _train_experts(
-    session: _Session, compiled: _Compiled, keeper: Keeper, report: Reporter
+    session: _Session, compiled: _Compiled, checkpointer: Checkpointer, report: Reporter
 ) -> Demonstrations:
-    grid = session.grid
+    config = session.config
     return experts.make_pool(
         session.keys.experts,
         session.env,
-        grid.experts,
-        grid.expert,
+        config.experts,
+        config.expert,
         compiled.method(METHODS["ddpg"], Settings()),
-        _stepwise(report, grid.experts.seeds),
-        keeper,
+        _stepwise(report, config.experts.seeds),
+        checkpointer,
     )
 
 
 def _train_cell(
     session: _Session,
     compiled: _Compiled,
-    keeper: Keeper,
+    checkpointer: Checkpointer,
     cell: Cell,
     data: HotStartData | None,
     metadata: dict[str, Any],
     report: Reporter,
 ) -> None:
-    """Train a cell, judge its policies, and write what came of it."""
-    grid, env, keys, budget = session.grid, session.env, session.keys, session.budget
+    """Train a cell, evaluator its policies, and write what came of it."""
+    config, env, keys, budget = session.config, session.env, session.keys, session.budget
     if cell.method.tabular is None or cell.method.interacts:
-        programs = compiled.method(cell.method, grid.settings)
+        programs = compiled.method(cell.method, config.settings)
         result = cell_lib.train(
             programs,
             keys.learners,
             data if cell.n_demos else None,
             cell.n_demos,
-            seeds_count=grid.seeds,
+            seeds_count=config.seeds,
             budget=budget if cell.method.interacts else dataclasses.replace(budget, max_steps=0),
             threshold=env.spec.reward_threshold,
-            report=_stepwise(report, grid.seeds),
-            keeper=keeper,
+            report=_stepwise(report, config.seeds),
+            checkpointer=checkpointer,
         )
     else:
         programs = compiled.tabular(cell.method)
@@ -253,11 +267,11 @@ def _train_cell(
             keys.learners,
             data,
             cell.n_demos,
-            seeds_count=grid.seeds,
-            evaluation_starts=grid.evaluation_starts,
-            keeper=keeper,
+            seeds_count=config.seeds,
+            evaluation_starts=config.evaluation_starts,
+            checkpointer=checkpointer,
         )
-    fresh = programs.judge.on_fresh_starts(result.best, keys.fresh_starts, FRESH_STARTS)
+    fresh = programs.evaluator.on_fresh_starts(result.best, keys.fresh_starts, FRESH_STARTS)
     rows = tables.rows(
         result,
         {
@@ -266,19 +280,19 @@ def _train_cell(
             "n_demos": cell.n_demos,
         },
         best_return=evaluator_lib.summarise(fresh).return_mean,
-        replay=gymnasium_replay.replay(programs.judge, result.best, env),
+        replay=gymnasium_replay.replay(programs.evaluator, result.best, env),
         expert_steps=metadata.get("expert_env_steps", 0) if cell.n_demos else 0,
     )
     if exchange.is_writer():
-        keeper.wait()
+        checkpointer.wait()
         for name, tree in (("policies", result.best), ("rewards", result.reward)):
-            path = grid.folder / name / cell.name
+            path = config.folder / name / cell.name
             # What a process left that was killed here before, whole or not.
             shutil.rmtree(path, ignore_errors=True)
             if tree is not None:
                 orbax_worker.call(checkpoint.save, path, tree)
-        sealing.append(grid.folder, rows)
-        keeper.remove()
+        sealing.append(config.folder, rows)
+        checkpointer.remove()
 
 
 def _stepwise(report: Reporter, seeds_count: int) -> Callable[[cell_lib.Progress], None]:

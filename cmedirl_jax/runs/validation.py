@@ -52,82 +52,82 @@ class Cell(NamedTuple):
         return f"{self.method.name}-n{self.n_demos}" if self.n_demos else self.method.name
 
 
-def cells_of(grid: StudyConfig) -> list[Cell]:
+def cells_of(config: StudyConfig) -> list[Cell]:
     """The grid's cells; a method without demonstrations has one."""
     return [
         Cell(METHODS[name], n_demos)
-        for name in grid.methods
-        for n_demos in (grid.n_demos if METHODS[name].uses_demonstrations else (0,))
+        for name in config.methods
+        for n_demos in (config.n_demos if METHODS[name].uses_demonstrations else (0,))
     ]
 
 
-def budget_of(grid: StudyConfig, env: Env) -> Budget:
+def budget_of(config: StudyConfig, env: Env) -> Budget:
     """How long each learner trains."""
-    most = [grid.max_steps]
-    if grid.max_episodes is not None:
-        most.append(grid.max_episodes * env.spec.max_episode_steps)
+    most = [config.max_steps]
+    if config.max_episodes is not None:
+        most.append(config.max_episodes * env.spec.max_episode_steps)
     return Budget(
         max_steps=min(steps for steps in most if steps is not None),
-        max_episodes=grid.max_episodes,
-        evaluate_every=grid.evaluate_every,
-        evaluation_starts=grid.evaluation_starts,
-        evaluate_every_episodes=grid.evaluate_every_episodes,
-        evaluation_starts_episodes=grid.evaluation_starts_episodes,
+        max_episodes=config.max_episodes,
+        evaluate_every=config.evaluate_every,
+        evaluation_starts=config.evaluation_starts,
+        evaluate_every_episodes=config.evaluate_every_episodes,
+        evaluation_starts_episodes=config.evaluation_starts_episodes,
     )
 
 
-def check(grid: StudyConfig) -> None:
+def check(config: StudyConfig) -> None:
     """Refuse what can be refused before any work.
 
     Raises:
         UserError: naming the option, what is wrong and what would be right.
     """
-    for method in grid.methods:
+    for method in config.methods:
         if method not in METHODS:
             raise UserError(f"--methods: unknown method {method!r}; there are {', '.join(METHODS)}")
     try:
-        env = envs.make(grid.env)
+        env = envs.make(config.env)
     except ValueError as error:
         raise UserError(f"--env: {error}") from error
     for name in ("methods", "n_demos"):
-        values = getattr(grid, name)
+        values = getattr(config, name)
         if not values or len(set(values)) < len(values):
             raise UserError(f"--{name.replace('_', '-')}: give one or more, each once")
-    if grid.demos is not None and not str(grid.demos).isprintable():
-        raise UserError(f"--demos: {str(grid.demos)!r} cannot be printed; give a plainer name")
-    if grid.max_steps is None and grid.max_episodes is None:
+    if config.demos is not None and not str(config.demos).isprintable():
+        raise UserError(f"--demos: {str(config.demos)!r} cannot be printed; give a plainer name")
+    if config.max_steps is None and config.max_episodes is None:
         raise UserError("--max-steps: give a number, or give --max-episodes")
-    _check_ranges(grid)
-    _check_epsilon(grid.settings.exploration)
+    _check_ranges(config)
+    _check_epsilon(config.settings.exploration)
     try:
-        networks.make(env.spec, grid.settings.architecture)
+        networks.make(env.spec, config.settings.architecture)
     except ValueError as error:
         raise UserError(f"--architecture: {error}") from error
-    if any(METHODS[name].tabular for name in grid.methods):
+    if any(METHODS[name].tabular for name in config.methods):
         try:
-            jax.eval_shape(lambda: imitation.discretised(env, grid.settings.tabular))
-            rewards.radial_basis(env.spec, grid.settings.tabular.centres)
+            jax.eval_shape(lambda: imitation.discretised(env, config.settings.tabular))
+            rewards.radial_basis(env.spec, config.settings.tabular.centres)
         except ValueError as error:
             raise UserError(f"--tabular: {error}") from error
-    capacity = budget_of(grid, env).max_steps
+    capacity = budget_of(config, env).max_steps
     if capacity >= 2**31:
         raise UserError(f"--max-episodes: makes {capacity} steps, more than 2^31 - 1")
-    for name in grid.methods:
+    for name in config.methods:
         try:
-            compose.compose(env.spec, METHODS[name], grid.settings, capacity)
+            compose.compose(env.spec, METHODS[name], config.settings, capacity)
         except ValueError as error:
             raise UserError(f"--methods {name}: {error}") from error
-    if grid.demos is None:
-        check_enough(grid, grid.experts.trajectories)
+    if config.demos is None:
+        check_enough(config, config.experts.trajectories)
 
 
-def _check_ranges(grid: StudyConfig) -> None:
+def _check_ranges(config: StudyConfig) -> None:
     """Refuse a number out of its range.
 
     Raises:
         UserError: naming the option, what it must be and what it is.
     """
-    for name, wrong in ranges.out_of_range(grid, RANGES):
+    for name, wrong in ranges.out_of_range(config, RANGES):
         option = name.removeprefix("settings.").replace("_", "-")
         raise UserError(f"--{option}: {wrong}")
 
@@ -139,42 +139,42 @@ def _check_epsilon(settings: ExplorationSettings) -> None:
         raise UserError(f"--exploration.hot-start-factor: makes epsilon {largest:g}, above 1")
 
 
-def load_demonstrations(grid: StudyConfig, env: Env) -> Demonstrations:
+def load_demonstrations(config: StudyConfig, env: Env) -> Demonstrations:
     """The file that `--demos` names.
 
     Raises:
         UserError: if it is missing, damaged, foreign, or holds too few.
     """
-    assert grid.demos is not None
+    assert config.demos is not None
     try:
-        pool = demonstrations.load(grid.demos, env.spec)
+        pool = demonstrations.load(config.demos, env.spec)
     except FileNotFoundError as error:
         raise UserError(
-            f"--demos: there is no file {grid.demos}; give one that demonstrations.save wrote"
+            f"--demos: there is no file {config.demos}; give one that demonstrations.save wrote"
         ) from error
     except OSError as error:
-        raise UserError(f"--demos: {grid.demos}: {error.strerror}") from error
+        raise UserError(f"--demos: {config.demos}: {error.strerror}") from error
     except ValueError as error:
         raise UserError(f"--demos: {error}") from error
     # The tables have a column of each.
     expert = pool.metadata.get("expert", "")
     if not isinstance(expert, str):
-        raise UserError(f"--demos: {grid.demos}: expert in its metadata is {expert!r}, no text")
+        raise UserError(f"--demos: {config.demos}: expert in its metadata is {expert!r}, no text")
     steps = pool.metadata.get("expert_env_steps", 0)
     if type(steps) is not int or not 0 <= steps < 2**63:
         raise UserError(
-            f"--demos: {grid.demos}: expert_env_steps in its metadata is {steps!r}, no count"
+            f"--demos: {config.demos}: expert_env_steps in its metadata is {steps!r}, no count"
         )
-    check_enough(grid, int(pool.episode[-1]) + 1)
+    check_enough(config, int(pool.episode[-1]) + 1)
     return pool
 
 
-def check_enough(grid: StudyConfig, held: int) -> None:
+def check_enough(config: StudyConfig, held: int) -> None:
     """Refuse to draw more demonstrations than the pool holds.
 
     Raises:
         UserError: saying how many there are.
     """
-    asked = max(cell.n_demos for cell in cells_of(grid))
+    asked = max(cell.n_demos for cell in cells_of(config))
     if asked > held:
         raise UserError(f"--n-demos: {asked} asked, the pool holds {held}")

@@ -36,32 +36,36 @@ Kind = Literal["linear", "deep"]
 
 @dataclasses.dataclass(frozen=True)
 class TabularSettings:
-    """The grid and the fit. All static."""
+    """The grid and the fit. All static.
+
+    Attributes:
+        states: Points along each dimension of the observation.
+        actions: Points along each dimension of the action.
+        subsamples: Transitions averaged for each state, along each dimension.
+        discount: Discount of the soft-optimal policy and of both visitations.
+        temperature: Temperature alpha of the soft-optimal policy.
+        reward: Whether the reward is of pairs or of states alone.
+        prior_precision: Precision of the Gaussian prior on theta, against the log-likelihood of one
+            demonstration.
+        steps: Steps of Adam.
+        centres: Radial basis functions along each dimension of the observation, of a linear reward.
+        hidden: Units of each hidden layer, of a deep reward.
+        linear_learning_rate: Adam's rate for a linear reward.
+        deep_learning_rate: Adam's rate for a deep reward.
+    """
 
     states: int = 41
-    """Points along each dimension of the observation."""
     actions: int = 7
-    """Points along each dimension of the action."""
     subsamples: int = 1
-    """Transitions averaged for each state, along each dimension."""
     discount: float = 0.99
-    """Discount of the soft-optimal policy and of both visitations."""
     temperature: float = 1.0
-    """Temperature alpha of the soft-optimal policy."""
     reward: rewards.Inputs = "state-action"
-    """Whether the reward is of pairs or of states alone."""
     prior_precision: float = 1e-3
-    """Precision of the Gaussian prior on theta, against the log-likelihood of one demonstration."""
     steps: int = 100
-    """Steps of Adam."""
     centres: int = 9
-    """Radial basis functions along each dimension of the observation, of a linear reward."""
     hidden: tuple[int, ...] = (64, 64)
-    """Units of each hidden layer, of a deep reward."""
     linear_learning_rate: float = 0.3
-    """Adam's rate for a linear reward."""
     deep_learning_rate: float = 1e-2
-    """Adam's rate for a deep reward."""
 
 
 def discretised(

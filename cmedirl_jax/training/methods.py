@@ -94,12 +94,16 @@ PAPER_METHODS = ("ddpg", "hs-ddpg", "me-ddpg", "hs-me-ddpg")
 
 @dataclasses.dataclass(frozen=True)
 class ExplorationSettings:
-    """The behaviour policy."""
+    """The behaviour policy.
+
+    Attributes:
+        kind: Which noise; the options of the others are ignored.
+        hot_start_factor: Factor on the noise of a hot-started method: on sigma, on the scale, or on
+            both epsilons.
+    """
 
     kind: Literal["ornstein-uhlenbeck", "gaussian", "epsilon-greedy"] = "ornstein-uhlenbeck"
-    """Which noise; the options of the others are ignored."""
     hot_start_factor: float = 1.0
-    """Factor on the noise of a hot-started method: on sigma, on the scale, or on both epsilons."""
     ornstein_uhlenbeck: OrnsteinUhlenbeckHParams = OrnsteinUhlenbeckHParams()
     gaussian: GaussianHParams = GaussianHParams()
     epsilon_greedy: EpsilonGreedyHParams = EpsilonGreedyHParams()
@@ -107,18 +111,21 @@ class ExplorationSettings:
 
 @dataclasses.dataclass(frozen=True)
 class RewardNetworkSettings:
-    """The reward network. All static."""
+    """The reward network. All static.
+
+    Attributes:
+        kind: A perceptron, or theta^T phi (Eq. 1) with one of two kinds of features.
+        inputs: r(s, a), or r(s).
+        hidden: Units of each hidden layer of a deep reward.
+        centres: Radial basis functions along each dimension of the observation.
+        order: Highest frequency of the Fourier basis, along each dimension of its inputs.
+    """
 
     kind: Literal["deep", "radial-basis", "fourier"] = "deep"
-    """A perceptron, or theta^T phi (Eq. 1) with one of two kinds of features."""
     inputs: Literal["state-action", "state"] = "state-action"
-    """r(s, a), or r(s)."""
     hidden: tuple[int, ...] = (64, 64)
-    """Units of each hidden layer of a deep reward."""
     centres: int = 9
-    """Radial basis functions along each dimension of the observation."""
     order: int = 3
-    """Highest frequency of the Fourier basis, along each dimension of its inputs."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,44 +16,53 @@ from cmedirl_jax.irl.shaping import Shaping
 
 @dataclasses.dataclass(frozen=True)
 class RewardSchedule:
-    """When the reward is learned, and how r_D is used. All static."""
+    """When the reward is learned, and how r_D is used. All static.
+
+    Attributes:
+        period: Environment steps between updates of the reward.
+        iterations: Iterations K of Algorithm 1 at each update.
+        stop: Environment step from which r_D is frozen (and kept); None: never.
+        anneal_steps: Environment steps over which the weight of r_D falls linearly to 0; None:
+            stays 1.
+        storage: Compute r_D anew when a transition is sampled, or store r* = r_D + r_e at
+            collection.
+        shaping: How r_D joins r_e in a method that adds them: r_e + r_D, r_e + gamma Phi(s') -
+            Phi(s) with r_D(s) for Phi, or r_D alone; None: as the method says.
+    """
 
     period: int = 4
-    """Environment steps between updates of the reward."""
     iterations: int = 1
-    """Iterations K of Algorithm 1 at each update."""
     stop: int | None = 2000
-    """Environment step from which r_D is frozen (and kept); None: never."""
     anneal_steps: int | None = None
-    """Environment steps over which the weight of r_D falls linearly to 0; None: stays 1."""
     storage: Literal["recompute", "store"] = "recompute"
-    """Compute r_D anew when a transition is sampled, or store r* = r_D + r_e at collection."""
     shaping: Shaping | None = None
-    """How r_D joins r_e in a method that adds them: r_e + r_D, r_e + gamma Phi(s') - Phi(s) with
-    r_D(s) for Phi, or r_D alone; None: as the method says."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
-    """The training loop."""
+    """The training loop.
+
+    Attributes:
+        batch_size: Transitions per update.
+        replay_capacity: Transitions the replay holds; None: every one of the run.
+        learning_starts: Environment steps before the first update.
+        update_period: Environment steps between updates of actor and critic.
+        target_period: Environment steps between target updates (the paper: 300, with agent.tau 1).
+        frozen_actor_steps: Environment steps for which a hot-started actor is not updated, while
+            the critic learns.
+        cloning: How agent.behaviour_cloning of a hot-started method goes on: left out, at its full
+            weight, or falling linearly to 0.
+        behaviour_cloning_steps: Environment steps over which "annealed" cloning falls.
+    """
 
     batch_size: int = 32
-    """Transitions per update."""
     replay_capacity: int | None = None
-    """Transitions the replay holds; None: every one of the run."""
     learning_starts: int = 200
-    """Environment steps before the first update."""
     update_period: int = 1
-    """Environment steps between updates of actor and critic."""
     target_period: int = 1
-    """Environment steps between target updates (the paper: 300, with agent.tau 1)."""
     frozen_actor_steps: int = 0
-    """Environment steps for which a hot-started actor is not updated, while the critic learns."""
     cloning: Literal["none", "constant", "annealed"] = "annealed"
-    """How agent.behaviour_cloning of a hot-started method goes on: left out, at its full weight, or
-    falling linearly to 0."""
     behaviour_cloning_steps: int = 4000
-    """Environment steps over which "annealed" cloning falls."""
 
 
 class Plan(NamedTuple):

@@ -314,11 +314,11 @@ def fake_training(monkeypatch):
 
     weight = np.random.default_rng(0).random(1_000)
 
-    def train(*_, keeper, **__):
+    def train(*_, checkpointer, **__):
         for step in range(10):
             time.sleep(0.01)
-            if keeper is not None:
-                keeper.visit(step, lambda: ({"weight": weight}, {"step": np.ones(1)}))
+            if checkpointer is not None:
+                checkpointer.save_if_due(step, lambda: ({"weight": weight}, {"step": np.ones(1)}))
 
     monkeypatch.setattr(checkpoint_cost.cells, "train", train)
 

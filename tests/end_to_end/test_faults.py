@@ -247,7 +247,7 @@ def test_a_run_needs_no_reader(runs, whole, tmp_path):
 def again(runs, whole, tmp_path, monkeypatch):
     """The command within this process, on a run that is finished."""
     folder = shutil.copytree(whole, tmp_path / "again")
-    monkeypatch.setattr(run_grid, "start_devices", lambda grid: jax.devices()[:1])
+    monkeypatch.setattr(run_grid, "start_devices", lambda config: jax.devices()[:1])
     return lambda: run_grid.main(runs.command(folder)[3:])
 
 

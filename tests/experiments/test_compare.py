@@ -42,8 +42,10 @@ def cell(method, n_demos, curves, diverged=()):
 
 
 def write_config(folder, **changes):
-    grid = dataclasses.replace(PRESETS["smoke"], out=folder, seeds=SEEDS, max_steps=200, **changes)
-    with run_folder.opened(grid):
+    config = dataclasses.replace(
+        PRESETS["smoke"], out=folder, seeds=SEEDS, max_steps=200, **changes
+    )
+    with run_folder.opened(config):
         pass
 
 

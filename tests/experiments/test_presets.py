@@ -30,21 +30,21 @@ def test_a_preset_knows_its_name_and_its_folder(name):
 
 
 def test_the_default_study_is_the_tuned_one_of_the_design():
-    grid = parse([])
-    assert grid == PRESETS["tuned"]
-    assert grid.methods == ("ddpg", "hs-ddpg", "me-ddpg", "hs-me-ddpg")
-    assert (grid.n_demos, grid.seeds, grid.max_steps, grid.max_episodes) == (
+    config = parse([])
+    assert config == PRESETS["tuned"]
+    assert config.methods == ("ddpg", "hs-ddpg", "me-ddpg", "hs-me-ddpg")
+    assert (config.n_demos, config.seeds, config.max_steps, config.max_episodes) == (
         (200,),
         100,
         12_000,
         None,
     )
-    assert (grid.evaluate_every, grid.evaluation_starts) == (250, 10)
+    assert (config.evaluate_every, config.evaluation_starts) == (250, 10)
 
 
 def test_paper_is_the_papers_letter():
-    grid = PRESETS["paper"]
-    settings = grid.settings
+    config = PRESETS["paper"]
+    settings = config.settings
     agent, exploration = settings.agent, settings.exploration
     assert agent.actor_learning_rate == agent.critic_learning_rate == 1e-5
     assert settings.reward.learning_rate == 1e-5
@@ -64,27 +64,27 @@ def test_paper_is_the_papers_letter():
     assert settings.reward.bounded_by == "none"
     assert settings.hot_start.critic == "softmax"
     assert settings.schedule.cloning == "none"
-    assert grid.seeds == 100
-    assert (grid.evaluate_every_episodes, grid.evaluation_starts_episodes) == (100, 100)
-    assert grid.max_steps is None
-    assert grid.evaluate_every == 1_000
+    assert config.seeds == 100
+    assert (config.evaluate_every_episodes, config.evaluation_starts_episodes) == (100, 100)
+    assert config.max_steps is None
+    assert config.evaluate_every == 1_000
 
 
 def test_a_budget_of_episodes_alone_leaves_room_for_the_longest():
-    grid = PRESETS["paper"]
-    budget = validation.budget_of(grid, envs.make(grid.env))
+    config = PRESETS["paper"]
+    budget = validation.budget_of(config, envs.make(config.env))
     assert (budget.max_episodes, budget.max_steps) == (150, 150 * 999)
 
 
 @pytest.mark.parametrize(("max_steps", "expected"), [(1_000, 1_000), (10_000, 1_998)])
 def test_a_budget_of_both_takes_the_smaller(max_steps, expected):
-    grid = dataclasses.replace(PRESETS["tuned"], max_steps=max_steps, max_episodes=2)
-    assert validation.budget_of(grid, envs.make(grid.env)).max_steps == expected
+    config = dataclasses.replace(PRESETS["tuned"], max_steps=max_steps, max_episodes=2)
+    assert validation.budget_of(config, envs.make(config.env)).max_steps == expected
 
 
 def test_a_method_without_demonstrations_has_one_cell():
-    grid = dataclasses.replace(PRESETS["tuned"], methods=("ddpg", "me-ddpg"), n_demos=(1, 10))
-    cells = validation.cells_of(grid)
+    config = dataclasses.replace(PRESETS["tuned"], methods=("ddpg", "me-ddpg"), n_demos=(1, 10))
+    cells = validation.cells_of(config)
     assert [(cell.method.name, cell.n_demos) for cell in cells] == [
         ("ddpg", 0),
         ("me-ddpg", 1),
@@ -119,10 +119,10 @@ def test_dotted_options_reach_the_nested_settings_and_leave_the_rest_to_the_pres
         "--exploration.hot-start-factor": "0.25",
     }
     words = (word for option in options.items() for word in option)
-    grid = parse(["--preset", "smoke", *words, "--agent.q-filter"])
+    config = parse(["--preset", "smoke", *words, "--agent.q-filter"])
     before = PRESETS["smoke"]
     settings = before.settings
-    assert grid.settings == dataclasses.replace(
+    assert config.settings == dataclasses.replace(
         settings,
         agent=settings.agent.replace(tau=0.5, q_filter=True),
         reward=settings.reward.replace(bound=0.2),
@@ -135,8 +135,8 @@ def test_dotted_options_reach_the_nested_settings_and_leave_the_rest_to_the_pres
         hot_start=settings.hot_start.replace(critic="large-margin", margin=0.5),
         schedule=dataclasses.replace(settings.schedule, frozen_actor_steps=60, cloning="constant"),
     )
-    assert grid.experts == dataclasses.replace(before.experts, steps=70)
-    assert dataclasses.replace(grid, settings=settings, experts=before.experts) == before
+    assert config.experts == dataclasses.replace(before.experts, steps=70)
+    assert dataclasses.replace(config, settings=settings, experts=before.experts) == before
 
 
 @pytest.mark.parametrize("arguments", [["--preset", "none"], ["--tau", "0.5"], ["--seeds", "many"]])
@@ -153,7 +153,7 @@ def test_the_librarys_defaults_are_the_tuned_preset():
 
 
 def test_everything_about_the_learned_reward_has_a_dotted_name():
-    grid = parse(
+    config = parse(
         [
             *("--methods", "me-ddpg", "gail"),
             *("--reward.objective", "transition", "--reward.gradient-penalty", "0.5"),
@@ -164,7 +164,7 @@ def test_everything_about_the_learned_reward_has_a_dotted_name():
             *("--gail.form", "logit D", "--exploration.epsilon-greedy.noise", "0.2"),
         ]
     )
-    settings = grid.settings
+    settings = config.settings
     assert settings.reward == IRLHParams(
         objective="transition",
         gradient_penalty=0.5,
@@ -179,4 +179,4 @@ def test_everything_about_the_learned_reward_has_a_dotted_name():
     assert settings.reward_network == network
     assert settings.gail.form == "logit D"
     assert settings.exploration.epsilon_greedy.noise == 0.2
-    validation.check(grid)
+    validation.check(config)

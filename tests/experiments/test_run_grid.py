@@ -47,7 +47,7 @@ def run_command(*arguments, **environment):
 def main(tmp_path, monkeypatch):
     """The command in an empty working directory, on a device of this process."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run_grid, "start_devices", lambda grid: jax.devices()[:1])
+    monkeypatch.setattr(run_grid, "start_devices", lambda config: jax.devices()[:1])
     return lambda *arguments: run_grid.main([str(argument) for argument in arguments])
 
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
-from cmedirl_jax.runs.cells.compiled import Programs, begin, pack
-from cmedirl_jax.runs.cells.record import Book, Budget, EpisodeRows, EvaluationRows
-from cmedirl_jax.runs.cells.slots import Lanes
+from cmedirl_jax.runs.cells.compiled import CompiledMethod, begin, pack
+from cmedirl_jax.runs.cells.record import Budget, EpisodeRows, EvaluationRows, Record
+from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.runs.cluster import exchange
-from cmedirl_jax.runs.storage.checkpoints import Keeper, Snapshot
+from cmedirl_jax.runs.storage.checkpoints import Checkpointer, Snapshot
 from cmedirl_jax.training import TrainingState
 from cmedirl_jax.training.evaluation import Evaluation
 
@@ -54,7 +54,7 @@ class CellResult(NamedTuple):
 
 
 def train(
-    programs: Programs,
+    programs: CompiledMethod,
     key: jax.Array,
     data: HotStartData | None,
     n_demos: int,
@@ -63,7 +63,7 @@ def train(
     budget: Budget,
     threshold: float,
     report: Callable[[Progress], None],
-    keeper: Keeper | None = None,
+    checkpointer: Checkpointer | None = None,
 ) -> CellResult:
     """Train a cell.
 
@@ -76,100 +76,102 @@ def train(
         budget: how long they train, and when they are evaluated.
         threshold: return that counts as solved, for the reports alone.
         report: called where training begins or goes on from, and after each chunk.
-        keeper: saves the training as it goes, and has what was saved of it before.
+        checkpointer: saves the training as it goes, and has what was saved of it before.
 
     Raises:
-        Interrupted: by the keeper.
+        Interrupted: by the checkpointer.
     """
 
-    lanes = Lanes(programs.lanes, seeds_count, programs.group, programs.devices)
+    slots = Slots(programs.slots, seeds_count, programs.group, programs.devices)
 
     def init() -> TrainingState:
-        return begin(programs, lanes, key, data, n_demos)
+        return begin(programs, slots, key, data, n_demos)
 
     abstract = functools.cache(lambda: jax.eval_shape(init))
     saved = None
-    if keeper is not None:
-        saved = keeper.load(lambda record: _Training.saved_like(abstract(), seeds_count, record))
+    if checkpointer is not None:
+        saved = checkpointer.load(
+            lambda arrays: _Training.saved_like(abstract(), seeds_count, arrays)
+        )
     if saved is None:
-        training = _Training.begin(programs, data, budget, lanes, init())
+        training = _Training.begin(programs, data, budget, slots, init())
     else:
-        training = _Training.go_on(programs, data, budget, lanes, abstract(), saved)
-    report(Progress(training.step, training.book.solved_fraction(threshold)))
+        training = _Training.go_on(programs, data, budget, slots, abstract(), saved)
+    report(Progress(training.step, training.record.solved_fraction(threshold)))
     for stop in _chunk_ends(training.step, budget):
-        if not training.book.running.any():
+        if not training.record.running.any():
             break
         training.advance(stop)
-        report(Progress(stop, training.book.solved_fraction(threshold)))
-        if keeper is not None:
-            keeper.visit(stop, training.snapshot)
+        report(Progress(stop, training.record.solved_fraction(threshold)))
+        if checkpointer is not None:
+            checkpointer.save_if_due(stop, training.snapshot)
     return training.result()
 
 
 class _Training:
-    """A cell in training: its seeds in their lanes, their record, and the best policy of each."""
+    """A cell in training: its seeds in their slots, their record, and the best policy of each."""
 
     def __init__(
         self,
-        programs: Programs,
+        programs: CompiledMethod,
         data: HotStartData | None,
-        book: Book,
-        lanes: Lanes,
+        record: Record,
+        slots: Slots,
         state: TrainingState,
     ):
-        self.programs, self.data, self.book = programs, data, book
-        self.lanes, self.state, self.step = lanes, state, 0
+        self.programs, self.data, self.record = programs, data, record
+        self.slots, self.state, self.step = slots, state, 0
         self.best: Any = None
         self.best_return: Any = None
 
     @classmethod
     def begin(
         cls,
-        programs: Programs,
+        programs: CompiledMethod,
         data: HotStartData | None,
         budget: Budget,
-        lanes: Lanes,
+        slots: Slots,
         state: TrainingState,
     ) -> "_Training":
-        training = cls(programs, data, Book(lanes.seeds, budget), lanes, state)
-        every = np.arange(lanes.seeds)
+        training = cls(programs, data, Record(slots.seeds, budget), slots, state)
+        every = np.arange(slots.seeds)
         found = training._evaluate(
-            budget.evaluation_starts, lanes.groups(np.ones(lanes.seeds, bool))
+            budget.evaluation_starts, slots.groups(np.ones(slots.seeds, bool))
         )
-        training.best = _take(state.agent.actor, lanes.of_seed)
+        training.best = _take(state.agent.actor, slots.of_seed)
         training.best_return = jnp.asarray(found.return_mean)
-        training.book.evaluated("steps", every, found)
+        training.record.evaluated("steps", every, found)
         return training
 
     @classmethod
     def go_on(
         cls,
-        programs: Programs,
+        programs: CompiledMethod,
         data: HotStartData | None,
         budget: Budget,
-        lanes: Lanes,
+        slots: Slots,
         abstract: TrainingState,
         saved: Snapshot,
     ) -> "_Training":
-        lane_seed = saved.record.pop("lane_seed")
+        slot_seed = saved.record.pop("slot_seed")
         state = saved.state["training"]
-        if lane_seed.size == lanes.seed.size:
-            # Lane by lane as it was: elsewhere in its group a seed might round otherwise.
-            lanes.seed = lane_seed
+        if slot_seed.size == slots.seed.size:
+            # Lane by slot as it was: elsewhere in its group a seed might round otherwise.
+            slots.seed = slot_seed
         else:
-            lane = np.argsort(lane_seed)[np.minimum(lanes.seed, lanes.seeds - 1)]
-            state = jax.tree.map(lambda leaf: leaf[lane], state)
+            slot = np.argsort(slot_seed)[np.minimum(slots.seed, slots.seeds - 1)]
+            state = jax.tree.map(lambda leaf: leaf[slot], state)
         state = jax.tree.map(_typed, abstract, jax.device_put(state, programs.sharding))
-        training = cls(programs, data, Book.of_record(saved.record, budget), lanes, state)
+        training = cls(programs, data, Record.from_arrays(saved.record, budget), slots, state)
         training.step = saved.step
         training.best, training.best_return = saved.state["best"], saved.state["best_return"]
         return training
 
     @staticmethod
     def saved_like(
-        abstract: TrainingState, seeds_count: int, record: dict[str, np.ndarray]
+        abstract: TrainingState, seeds_count: int, arrays: dict[str, np.ndarray]
     ) -> dict[str, Any]:
-        """The tree that `snapshot` saved along with `record`, with shapes for arrays."""
+        """The tree that `snapshot` saved along with `arrays`, with shapes for arrays."""
 
         def sized(count: int, tree: Any) -> Any:
             return jax.tree.map(
@@ -178,7 +180,7 @@ class _Training:
 
         state = jax.eval_shape(lambda state: jax.tree.map(_untyped, state), abstract)
         return {
-            "training": sized(record["lane_seed"].size, state),
+            "training": sized(arrays["slot_seed"].size, state),
             "best": sized(seeds_count, state.agent.actor),
             "best_return": jax.ShapeDtypeStruct((seeds_count,), jnp.float32),
         }
@@ -190,60 +192,60 @@ class _Training:
             "best": self.best,
             "best_return": self.best_return,
         }
-        record = {"lane_seed": self.lanes.seed.copy(), **self.book.record()}
-        return jax.tree.map(np.array, exchange.gather(tree)), record
+        arrays = {"slot_seed": self.slots.seed.copy(), **self.record.to_arrays()}
+        return jax.tree.map(np.array, exchange.gather(tree)), arrays
 
     def advance(self, stop: int) -> None:
         """Take the steps up to `stop`, and evaluate the seeds that are due."""
-        book, budget, lanes = self.book, self.book.budget, self.lanes
-        active = book.running | (book.pending & ~book.diverged)
-        self.state, groups = pack(self.programs, lanes, self.state, active)
+        record, budget, slots = self.record, self.record.budget, self.slots
+        active = record.running | (record.pending & ~record.diverged)
+        self.state, groups = pack(self.programs, slots, self.state, active)
         limit = None if budget.max_episodes is None else jnp.int32(budget.max_episodes)
         steps = jnp.arange(self.step, stop, dtype=jnp.int32)
         self.state, log = self.programs.run(self.state, groups, self.data, steps, limit)
         self.step = stop
-        was_running = book.running.copy()
+        was_running = record.running.copy()
         finite, log = self._of_seeds((_finite(self.state), log))
-        book.mark_diverged(finite)
-        book.stepped(steps=np.asarray(steps), log=log)
-        due = np.flatnonzero(book.due_by_episodes() & ~book.diverged)
+        record.mark_diverged(finite)
+        record.stepped(steps=np.asarray(steps), log=log)
+        due = np.flatnonzero(record.due_by_episodes() & ~record.diverged)
         if due.size:
             found = self._evaluate(budget.evaluation_starts_episodes, groups)
-            book.evaluated("episodes", due, found)
-        book.pending |= was_running
-        over = stop == budget.max_steps or not book.running.any()
+            record.evaluated("episodes", due, found)
+        record.pending |= was_running
+        over = stop == budget.max_steps or not record.running.any()
         if stop % budget.evaluate_every == 0 or over:
             found = self._evaluate(budget.evaluation_starts, groups)
-            due = np.flatnonzero(book.pending & ~book.diverged)
-            book.evaluated("steps", due, found)
-            book.pending[:] = False
-            returns = np.full(lanes.seeds, -np.inf, found.return_mean.dtype)
+            due = np.flatnonzero(record.pending & ~record.diverged)
+            record.evaluated("steps", due, found)
+            record.pending[:] = False
+            returns = np.full(slots.seeds, -np.inf, found.return_mean.dtype)
             returns[due] = found.return_mean[due]
-            actor = _take(self.state.agent.actor, lanes.of_seed)
+            actor = _take(self.state.agent.actor, slots.of_seed)
             self.best, self.best_return = _keep_best(self.best, self.best_return, actor, returns)
 
     def result(self) -> CellResult:
-        book, state = self.book, self.state
+        record, state = self.record, self.state
         return CellResult(
-            evaluations=book.evaluations,
-            episodes=book.episode_rows(),
+            evaluations=record.evaluations,
+            episodes=record.episode_rows(),
             best=exchange.gather(self.best),
             reward=None if state.reward is None else self._of_seeds(state.reward.params),
-            env_steps=book.env_step,
-            demonstration_steps=np.zeros(self.lanes.seeds, np.int32)
+            env_steps=record.env_step,
+            demonstration_steps=np.zeros(self.slots.seeds, np.int32)
             if state.subset is None
             else self._of_seeds(state.subset.length).sum(axis=1),
-            diverged=book.diverged,
+            diverged=record.diverged,
             final=self._of_seeds(state.agent.actor),
         )
 
     def _of_seeds(self, tree: Any) -> Any:
-        """What lies in lanes, `[lanes, ...]`, as numpy `[seeds, ...]`."""
-        index = self.lanes.of_seed
+        """What lies in slots, `[slots, ...]`, as numpy `[seeds, ...]`."""
+        index = self.slots.of_seed
         return jax.tree.map(lambda leaf: leaf[index], exchange.gather(tree))
 
     def _evaluate(self, starts: int, groups: int) -> Evaluation:
-        found = self.programs.judge.on_starts(self.state.agent.actor, starts, groups)
+        found = self.programs.evaluator.on_starts(self.state.agent.actor, starts, groups)
         return self._of_seeds(evaluator_lib.summarise(found))
 
 

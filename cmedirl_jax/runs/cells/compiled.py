@@ -1,4 +1,4 @@
-"""The compiled functions of a method, and the lanes of seeds that they step."""
+"""The compiled functions of a method, and the slots of seeds that they step."""
 
 import functools
 from collections.abc import Callable
@@ -12,34 +12,34 @@ from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.envs import Env
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
-from cmedirl_jax.runs.cells.evaluator import Judge
+from cmedirl_jax.runs.cells.evaluator import Evaluator
 from cmedirl_jax.runs.cells.record import Budget
-from cmedirl_jax.runs.cells.slots import Lanes
+from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.training import Log, TrainingState, seeds
 from cmedirl_jax.training.methods import METHODS, Method, Settings
 
 
-class Programs(NamedTuple):
+class CompiledMethod(NamedTuple):
     """The compiled functions of a method. Every cell of the method uses the same ones.
 
     Attributes:
-        init: `(keys [lanes], groups, data, n_demonstrations) -> TrainingState` `[lanes, ...]`.
+        init: `(keys [slots], groups, data, n_demonstrations) -> TrainingState` `[slots, ...]`.
         run: `(state, groups, data, steps, max_episodes) -> (TrainingState, Log)`; the state is
-            donated. Only the first `groups` groups of lanes on each device move.
-        permute: `(state, move [lanes]) -> TrainingState`; lane i takes lane move[i]'s. Donated too.
-        judge: noise-free rollouts.
-        lanes: how many seeds fit in.
-        group: lanes that are stepped together on a device.
-        devices: devices that share the lanes.
-        sharding: how the lanes lie on them.
+            donated. Only the first `groups` groups of slots on each device move.
+        permute: `(state, move [slots]) -> TrainingState`; slot i takes slot move[i]'s. Donated too.
+        evaluator: noise-free rollouts.
+        slots: how many seeds fit in.
+        group: slots that are stepped together on a device.
+        devices: devices that share the slots.
+        sharding: how the slots lie on them.
     """
 
     init: Callable[..., TrainingState]
     run: Callable[..., tuple[TrainingState, Log]]
     permute: Callable[[TrainingState, np.ndarray], TrainingState]
-    judge: Judge
-    lanes: int
+    evaluator: Evaluator
+    slots: int
     group: int
     devices: int
     sharding: jax.sharding.Sharding
@@ -65,7 +65,7 @@ def compile_method(
     env: Env,
     method: Method,
     settings: Settings,
-    judge: Judge,
+    evaluator: Evaluator,
     draw_networks: Callable[[jax.Array, int], Any],
     *,
     group: int,
@@ -73,7 +73,7 @@ def compile_method(
     devices: list[jax.Device],
     capacity: int,
     subset_size: int | None,
-) -> Programs:
+) -> CompiledMethod:
     """Jit a method's training, over seeds in groups and over devices. Compiles at first use."""
     trainer = training.make(env, method, settings, capacity=capacity, subset_size=subset_size)
 
@@ -101,12 +101,12 @@ def compile_method(
     ) -> TrainingState:
         return start(keys, draw_networks(keys, groups), groups, data, n_demonstrations)
 
-    return Programs(
+    return CompiledMethod(
         init=init,
         run=jax.jit(spread(trainer.run), donate_argnums=0, out_shardings=split),
         permute=jax.jit(permute, donate_argnums=0, out_shardings=split),
-        judge=judge,
-        lanes=seeds.padded(seeds_count, group, len(devices)),
+        evaluator=evaluator,
+        slots=seeds.padded(seeds_count, group, len(devices)),
         group=group,
         devices=len(devices),
         sharding=split,
@@ -114,38 +114,38 @@ def compile_method(
 
 
 def begin(
-    programs: Programs, lanes: Lanes, key: jax.Array, data: HotStartData | None, n_demos: int
+    programs: CompiledMethod, slots: Slots, key: jax.Array, data: HotStartData | None, n_demos: int
 ) -> TrainingState:
-    """Initialise the seeds in `lanes`; the idle lanes behind them hold others."""
-    groups = lanes.groups(np.ones(lanes.seeds, bool))
-    keys = seeds.keys(key, programs.lanes)[lanes.seed]
+    """Initialise the seeds in `slots`; the idle slots behind them hold others."""
+    groups = slots.groups(np.ones(slots.seeds, bool))
+    keys = seeds.keys(key, programs.slots)[slots.seed]
     return programs.init(keys, groups, data, n_demos)
 
 
 def pack(
-    programs: Programs, lanes: Lanes, state: TrainingState, active: np.ndarray
+    programs: CompiledMethod, slots: Slots, state: TrainingState, active: np.ndarray
 ) -> tuple[TrainingState, int]:
     """Bring the seeds `active` `[seeds]` to the front; how many groups hold them now."""
-    move = lanes.pack(active)
+    move = slots.pack(active)
     if move is not None:
         state = programs.permute(state, move)
-    return state, lanes.groups(active)
+    return state, slots.groups(active)
 
 
 def compiler(
-    grid: StudyConfig, env: Env, budget: Budget, devices: list[jax.Device]
-) -> Callable[[Method, Settings], Programs]:
+    config: StudyConfig, env: Env, budget: Budget, devices: list[jax.Device]
+) -> Callable[[Method, Settings], CompiledMethod]:
     """A function that makes each method's programs once: for all cells, and for the experts too."""
-    seeds_count, capacity = grid.seeds, budget.max_steps
-    if grid.demos is None:
-        seeds_count = max(seeds_count, grid.experts.seeds)
-        capacity = max(capacity, grid.experts.steps)
+    seeds_count, capacity = config.seeds, budget.max_steps
+    if config.demos is None:
+        seeds_count = max(seeds_count, config.experts.seeds)
+        capacity = max(capacity, config.experts.steps)
 
     def group(architecture: Architecture) -> int:
-        return grid.group or seeds.group_size(grid.seeds, len(devices), architecture.hidden)
+        return config.group or seeds.group_size(config.seeds, len(devices), architecture.hidden)
 
     @functools.cache
-    def judge(architecture: Architecture) -> Judge:
+    def evaluator(architecture: Architecture) -> Evaluator:
         return evaluator_lib.of_networks(env, architecture, group(architecture), devices)
 
     @functools.cache
@@ -153,18 +153,18 @@ def compiler(
         return compile_networks(env, architecture, group(architecture), devices)
 
     @functools.cache
-    def compile_once(method: Method, settings: Settings) -> Programs:
+    def compile_once(method: Method, settings: Settings) -> CompiledMethod:
         return compile_method(
             env,
             method,
             settings,
-            judge(settings.architecture),
+            evaluator(settings.architecture),
             draw_networks(settings.architecture),
             group=group(settings.architecture),
             seeds_count=seeds_count,
             devices=devices,
             capacity=capacity,
-            subset_size=max(grid.n_demos),
+            subset_size=max(config.n_demos),
         )
 
     return compile_once

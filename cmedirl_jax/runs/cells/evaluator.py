@@ -15,7 +15,7 @@ from cmedirl_jax.training import evaluation, seeds
 from cmedirl_jax.training.evaluation import Evaluation, Rollouts
 
 
-class Judge(NamedTuple):
+class Evaluator(NamedTuple):
     """Compiled functions of policies' parameters `[seeds, ...]`, any number of seeds.
 
     Attributes:
@@ -33,8 +33,8 @@ class Judge(NamedTuple):
 
 def of_networks(
     env: Env, architecture: Architecture, group: int, devices: list[jax.Device]
-) -> Judge:
-    """A judge of actors of one architecture."""
+) -> Evaluator:
+    """An evaluator of actors of one architecture."""
     act = functools.partial(networks.policy, networks.make(env.spec, architecture))
     return make(env, act, group, devices)
 
@@ -44,8 +44,8 @@ def make(
     act: Callable[[Any, jax.Array], jax.Array],
     group: int,
     devices: list[jax.Device],
-) -> Judge:
-    """A judge of the policies `act(actor, observation)`, in groups of `group` on each device."""
+) -> Evaluator:
+    """An evaluator of policies `act(actor, observation)`, `group` at a time on each device."""
     params = env.default_params
 
     def on_starts(actors: Any, count: int, groups: int | None = None) -> Rollouts:
@@ -61,17 +61,17 @@ def make(
     @jax.jit
     def spread(actors: Any, starts: Any, groups: int | None = None) -> Rollouts:
         count = jax.tree.leaves(actors)[0].shape[0]
-        lanes = seeds.padded(count, group, len(devices))
+        slots = seeds.padded(count, group, len(devices))
         filled = jax.tree.map(
-            lambda x: jnp.concatenate([x, x[:1].repeat(lanes - count, 0)]), actors
+            lambda x: jnp.concatenate([x, x[:1].repeat(slots - count, 0)]), actors
         )
         if groups is None:
-            groups = lanes // (group * len(devices))
+            groups = slots // (group * len(devices))
         mapped = seeds.map_devices(seeds.step_groups(one, group), devices)
         _, found = mapped(filled, groups, starts)
         return jax.tree.map(lambda x: x[:count], found)
 
-    return Judge(on_starts, on_fresh_starts, act)
+    return Evaluator(on_starts, on_fresh_starts, act)
 
 
 def summarise(rollouts: Rollouts) -> Evaluation:

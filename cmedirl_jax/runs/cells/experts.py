@@ -12,12 +12,12 @@ from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells.cell import Progress
-from cmedirl_jax.runs.cells.compiled import Programs
+from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.cluster import exchange
 from cmedirl_jax.runs.config import Expert, ExpertSettings
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.storage.checkpoints import Keeper
+from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.types import Transition
 
 EVALUATION_STARTS = 100
@@ -29,9 +29,9 @@ def make_pool(
     env: Env,
     options: ExpertSettings,
     which: Expert,
-    programs: Programs,
+    programs: CompiledMethod,
     report: Callable[[Progress], None],
-    keeper: Keeper | None = None,
+    checkpointer: Checkpointer | None = None,
 ) -> Demonstrations:
     """Train experts and record noise-free trajectories, from fresh random starts.
 
@@ -42,10 +42,10 @@ def make_pool(
         which: who demonstrates, see `choose`.
         programs: DDPG's, with the settings that experts train with.
         report: called after each chunk of training.
-        keeper: saves the training as it goes.
+        checkpointer: saves the training as it goes.
 
     Raises:
-        Interrupted: by the keeper.
+        Interrupted: by the checkpointer.
         UserError: if no expert's final policy reaches the environment's threshold.
     """
     train_key, start_key = jax.random.split(key)
@@ -59,7 +59,7 @@ def make_pool(
         budget=Budget(options.steps, None, options.steps, EVALUATION_STARTS),
         threshold=threshold,
         report=report,
-        keeper=keeper,
+        checkpointer=checkpointer,
     )
     final = result.evaluations[-1]
     returns = np.where(result.diverged, -np.inf, 0.0)
@@ -78,7 +78,7 @@ def make_pool(
     @jax.jit
     @jax.vmap
     def record_all(actor: Any, key: jax.Array) -> tuple[Transition, jax.Array, jax.Array]:
-        return record(programs.judge.act, env, actor, key, per_expert)
+        return record(programs.evaluator.act, env, actor, key, per_expert)
 
     metadata = {
         "env": env.spec.id,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax.envs import Env
-from cmedirl_jax.runs.cells.evaluator import Judge
+from cmedirl_jax.runs.cells.evaluator import Evaluator
 from cmedirl_jax.runs.cluster import exchange
 
 STARTS = 3
@@ -23,10 +23,10 @@ class Replay(NamedTuple):
     jax_return: np.ndarray
 
 
-def replay(judge: Judge, actors: Any, env: Env) -> Replay:
+def replay(evaluator: Evaluator, actors: Any, env: Env) -> Replay:
     """Run each seed's policy `[seeds, ...]` from the same starts in both environments."""
-    jax_return = exchange.gather(judge.on_starts(actors, STARTS).episode_return)
-    act = jax.jit(jax.vmap(judge.act))
+    jax_return = exchange.gather(evaluator.on_starts(actors, STARTS).episode_return)
+    act = jax.jit(jax.vmap(evaluator.act))
     return Replay(_run(lambda observations: act(actors, observations), actors, env), jax_return)
 
 

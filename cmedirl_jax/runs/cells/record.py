@@ -78,12 +78,12 @@ class EpisodeRows(NamedTuple):
 _EVALUATIONS = EvaluationRows(
     *EvaluationRows._fields[:4], Evaluation(*Evaluation._fields), Means(*Means._fields)
 )
-"""The name of every column in `Book.record`."""
+"""The name of every column in `Record.to_arrays`."""
 
 _SEEDS = ("env_step", "episode", "running", "pending", "diverged", "latest", "_episode_mark")
 
 
-class Book:
+class Record:
     """The record of `seeds_count` seeds; its arrays are `[seeds]`.
 
     Attributes:
@@ -190,8 +190,8 @@ class Book:
             *(np.concatenate(column) for column in zip(*self._episodes, strict=True))
         )
 
-    def record(self) -> dict[str, np.ndarray]:
-        """All of it as arrays by name, for `of_record`; copies, which the book does not change."""
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """All of it as arrays by name, for `from_arrays`; copies."""
         # Columns end to end, and how many rows each evaluation has; its protocol as a column too.
         rows = [
             found._replace(protocol=np.repeat(found.protocol, len(found.seed)))
@@ -199,7 +199,7 @@ class Book:
         ]
         evaluations = jax.tree.map(lambda *columns: np.concatenate(columns), *rows)
         named = zip(jax.tree.leaves(_EVALUATIONS), jax.tree.leaves(evaluations), strict=True)
-        record = {
+        arrays = {
             **{name: getattr(self, name) for name in _SEEDS},
             **{f"sums.{name}": column for name, column in self._sums._asdict().items()},
             **{f"updates.{name}": column for name, column in self._updates._asdict().items()},
@@ -207,23 +207,23 @@ class Book:
             **{f"evaluations.{name}": column for name, column in named},
             **{f"episodes.{name}": x for name, x in self.episode_rows()._asdict().items()},
         }
-        return {name: np.array(column) for name, column in record.items()}
+        return {name: np.array(column) for name, column in arrays.items()}
 
     @classmethod
-    def of_record(cls, record: dict[str, np.ndarray], budget: Budget) -> "Book":
-        """The book that gave this `record`, to be written on."""
-        book = cls(record["running"].size, budget)
+    def from_arrays(cls, arrays: dict[str, np.ndarray], budget: Budget) -> "Record":
+        """The record that gave these `arrays`, to be written on."""
+        record = cls(arrays["running"].size, budget)
         for name in _SEEDS:
-            setattr(book, name, record[name])
-        book._sums, book._updates = (
-            Means(*(record[f"{kind}.{name}"] for name in Means._fields))
+            setattr(record, name, arrays[name])
+        record._sums, record._updates = (
+            Means(*(arrays[f"{kind}.{name}"] for name in Means._fields))
             for kind in ("sums", "updates")
         )
-        ends = np.cumsum(record["evaluations"])
-        for start, stop in zip(ends - record["evaluations"], ends, strict=True):
+        ends = np.cumsum(arrays["evaluations"])
+        for start, stop in zip(ends - arrays["evaluations"], ends, strict=True):
             rows = jax.tree.map(
-                lambda name, of=slice(start, stop): record[f"evaluations.{name}"][of], _EVALUATIONS
+                lambda name, of=slice(start, stop): arrays[f"evaluations.{name}"][of], _EVALUATIONS
             )
-            book.evaluations.append(rows._replace(protocol=str(rows.protocol[0])))
-        book._episodes = [EpisodeRows(*(record[f"episodes.{x}"] for x in EpisodeRows._fields))]
-        return book
+            record.evaluations.append(rows._replace(protocol=str(rows.protocol[0])))
+        record._episodes = [EpisodeRows(*(arrays[f"episodes.{x}"] for x in EpisodeRows._fields))]
+        return record

@@ -12,10 +12,10 @@ from cmedirl_jax.data import demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells.cell import CellResult
-from cmedirl_jax.runs.cells.evaluator import Judge
+from cmedirl_jax.runs.cells.evaluator import Evaluator
 from cmedirl_jax.runs.cells.record import EpisodeRows, EvaluationRows, Means
 from cmedirl_jax.runs.cluster import exchange
-from cmedirl_jax.runs.storage.checkpoints import Keeper
+from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.training import seeds
@@ -37,21 +37,21 @@ class Fitted(NamedTuple):
     demonstration_steps: Any
 
 
-class Programs(NamedTuple):
+class CompiledFit(NamedTuple):
     """The compiled functions of a method.
 
     Attributes:
-        fit: `(keys [lanes], mdp, data, n_demonstrations) -> Fitted` `[lanes, ...]`.
+        fit: `(keys [slots], mdp, data, n_demonstrations) -> Fitted` `[slots, ...]`.
         mdp: the environment on the grid.
-        judge: of greedy policies, by tables of preferences `[seeds, S, A]`.
-        soft_judge: of the soft policies, by tables of log-probabilities `[seeds, S, A]`.
+        evaluator: of greedy policies, by tables of preferences `[seeds, S, A]`.
+        soft_evaluator: of the soft policies, by tables of log-probabilities `[seeds, S, A]`.
         devices: that share the seeds.
     """
 
     fit: Callable[..., Fitted]
     mdp: FiniteMDP
-    judge: Judge
-    soft_judge: Judge
+    evaluator: Evaluator
+    soft_evaluator: Evaluator
     devices: int
 
 
@@ -62,8 +62,8 @@ def compile_method(
     *,
     devices: list[jax.Device],
     subset_size: int | None,
-) -> Programs:
-    """Jit a method's fit and its judges. Compiles at first use."""
+) -> CompiledFit:
+    """Jit a method's fit and its evaluators. Compiles at first use."""
     kind = method.tabular
     assert kind is not None
     mdp = jax.jit(lambda: imitation.discretised(env, settings.tabular))()
@@ -86,24 +86,24 @@ def compile_method(
     def soft(table: jax.Array, observation: jax.Array) -> jax.Array:
         return discretise.look_up(mdp, table, observation)
 
-    return Programs(
+    return CompiledFit(
         fit=jax.jit(fit),
         mdp=mdp,
-        judge=evaluator_lib.make(env, greedy, 1, devices),
-        soft_judge=evaluator_lib.make(discretise.sampled(mdp, env), soft, 1, devices),
+        evaluator=evaluator_lib.make(env, greedy, 1, devices),
+        soft_evaluator=evaluator_lib.make(discretise.sampled(mdp, env), soft, 1, devices),
         devices=len(devices),
     )
 
 
 def train(
-    programs: Programs,
+    programs: CompiledFit,
     key: jax.Array,
     data: HotStartData,
     n_demos: int,
     *,
     seeds_count: int,
     evaluation_starts: int,
-    keeper: Keeper | None = None,
+    checkpointer: Checkpointer | None = None,
 ) -> CellResult:
     """Fit every seed and evaluate its greedy policy, and as protocol "soft" its soft one, once.
 
@@ -114,10 +114,10 @@ def train(
         n_demos: how many of them each seed draws.
         seeds_count: how many seeds.
         evaluation_starts: start states of the evaluations.
-        keeper: saves the seeds that are fitted, and has what was saved of them before.
+        checkpointer: saves the seeds that are fitted, and has what was saved of them before.
 
     Raises:
-        Interrupted: by the keeper.
+        Interrupted: by the checkpointer.
     """
     # A seed takes seconds: each device fits one between looks from the host.
     keys = seeds.keys(key, seeds_count + programs.devices)
@@ -138,13 +138,13 @@ def train(
         return fitted, {"fitted": np.array(len(fitted.reward))}
 
     fitted = 0
-    if keeper is not None and (saved := keeper.load(abstract)) is not None:
+    if checkpointer is not None and (saved := checkpointer.load(abstract)) is not None:
         fitted = saved.step
         parts.append(saved.state)
     for first in range(fitted, seeds_count, programs.devices):
         parts.append(exchange.gather(fit(keys[first : first + programs.devices])))
-        if keeper is not None:
-            keeper.visit(first + programs.devices, take)
+        if checkpointer is not None:
+            checkpointer.save_if_due(first + programs.devices, take)
     found = jax.tree.map(lambda leaf: leaf[:seeds_count], _joined(parts))
     table = found.log_probabilities
     every = np.arange(seeds_count)
@@ -155,8 +155,8 @@ def train(
         return EvaluationRows(protocol, every, zeros, zeros, found, unknown)
 
     greedy, soft = (
-        evaluator_lib.summarise(judge.on_starts(table, evaluation_starts))
-        for judge in (programs.judge, programs.soft_judge)
+        evaluator_lib.summarise(evaluator.on_starts(table, evaluation_starts))
+        for evaluator in (programs.evaluator, programs.soft_evaluator)
     )
     nothing = np.zeros(0, np.int32)
     return CellResult(

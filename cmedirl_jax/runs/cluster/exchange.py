@@ -24,13 +24,13 @@ _BLOCK, _PIECE = 2**12, 2**26
 """Bytes are sent in pieces, the last in whole blocks, so that few sizes are compiled."""
 
 
-def check_same(grid: StudyConfig) -> None:
+def check_same(config: StudyConfig) -> None:
     """See that every process was started with the same options. A collective.
 
     Raises:
         UserError: on every process, if one was not.
     """
-    mine = json.loads(json.dumps(dataclasses.asdict(grid), default=str))
+    mine = json.loads(json.dumps(dataclasses.asdict(config), default=str))
     writers = from_writer(lambda: mine)
     own = ("out", "coordinator", "process_id")
     other = [name for name in mine if name not in own and mine[name] != writers[name]]

@@ -19,48 +19,48 @@ from cmedirl_jax.runs.errors import UserError
 HEARTBEAT_TIMEOUT = 20
 """Seconds after which a process that has fallen silent counts as dead."""
 GONE = (
-    "run_grid: another process is gone, or never came; "
+    "another process is gone, or never came; "
     "start the same command on all machines again to continue"
 )
 _WORKER = "CMEDIRL_JAX_DISTRIBUTED_WORKER"
 
 
-def check(grid: StudyConfig) -> None:
+def check(config: StudyConfig) -> None:
     """Refuse options that contradict each other.
 
     Raises:
         UserError: naming the option, what is wrong and what would be right.
     """
-    if grid.coordinator is None:
+    if config.coordinator is None:
         for name in ("processes", "process_id"):
-            if getattr(grid, name) is not None:
+            if getattr(config, name) is not None:
                 raise UserError(f"--{name.replace('_', '-')}: needs --coordinator HOST:PORT")
         return
-    host, _, port = grid.coordinator.rpartition(":")
+    host, _, port = config.coordinator.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
-        raise UserError(f"--coordinator: must be HOST:PORT, got {grid.coordinator}")
-    if grid.processes is None or grid.process_id is None:
+        raise UserError(f"--coordinator: must be HOST:PORT, got {config.coordinator}")
+    if config.processes is None or config.process_id is None:
         raise UserError("--coordinator: needs --processes N and --process-id I too")
-    if grid.processes < 1:
-        raise UserError(f"--processes: must be at least 1, got {grid.processes}")
-    if not 0 <= grid.process_id < grid.processes:
-        last = grid.processes - 1
-        raise UserError(f"--process-id: must be between 0 and {last}, got {grid.process_id}")
+    if config.processes < 1:
+        raise UserError(f"--processes: must be at least 1, got {config.processes}")
+    if not 0 <= config.process_id < config.processes:
+        last = config.processes - 1
+        raise UserError(f"--process-id: must be between 0 and {last}, got {config.process_id}")
 
 
-def is_asked(grid: StudyConfig) -> bool:
+def is_asked(config: StudyConfig) -> bool:
     """Whether the run has several processes, of which this is one."""
-    return grid.distributed or grid.coordinator is not None
+    return config.distributed or config.coordinator is not None
 
 
-def supervise(arguments: Sequence[str]) -> int:
-    """Run this process's share in a child; returns the command's exit code.
+def supervise(module: str, arguments: Sequence[str]) -> int:
+    """Run this process's share, `python -m MODULE ARGUMENTS`, in a child; returns its exit code.
 
     JAX's runtime aborts a process that loses the coordinator, before Python can say a word; so
     somebody else must. The child ends when this process does.
     """
     child = subprocess.Popen(
-        [sys.executable, "-m", "experiments.run_grid", *arguments],
+        [sys.executable, "-m", module, *arguments],
         env=os.environ | {_WORKER: "1"},
         stdin=subprocess.PIPE,
         start_new_session=True,
@@ -68,11 +68,12 @@ def supervise(arguments: Sequence[str]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: child.send_signal(number))
     code = child.wait()
+    program = module.rpartition(".")[2]
     if code == -signal.SIGABRT:
-        streams.complain(GONE)
+        streams.complain(f"{program}: {GONE}")
         return 1
     if code < 0:
-        streams.complain(f"run_grid: ended by {signal.Signals(-code).name}")
+        streams.complain(f"{program}: ended by {signal.Signals(-code).name}")
         return 128 - code
     return code
 
@@ -82,7 +83,7 @@ def is_worker() -> bool:
     return _WORKER in os.environ
 
 
-def join(grid: StudyConfig) -> None:
+def join(config: StudyConfig) -> None:
     """Meet the other processes; before any other use of JAX.
 
     Raises:
@@ -90,20 +91,20 @@ def join(grid: StudyConfig) -> None:
     """
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # Else it listens where that says, and not on the coordinator's port.
-    if grid.process_id == 0 and "JAX_COORDINATOR_BIND_ADDRESS" not in os.environ:
-        assert grid.coordinator is not None
-        _check_port(int(grid.coordinator.rpartition(":")[2]))
+    if config.process_id == 0 and "JAX_COORDINATOR_BIND_ADDRESS" not in os.environ:
+        assert config.coordinator is not None
+        _check_port(int(config.coordinator.rpartition(":")[2]))
     # At once, unless noted: an exception would leave the others waiting.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     # It would take SIGTERM for itself.
     jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(
-            grid.coordinator,
-            grid.processes,
-            grid.process_id,
+            config.coordinator,
+            config.processes,
+            config.process_id,
             # With all four given, JAX looks for no cluster.
-            cluster_detection_method=None if grid.coordinator is None else "deactivate",
+            cluster_detection_method=None if config.coordinator is None else "deactivate",
             heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT,
         )
     except ValueError as error:
@@ -135,7 +136,7 @@ def _check_port(port: int) -> None:
         raise UserError(f"--coordinator: port {port} {reason}") from error
 
 
-def guarded(run: Callable[[], int]) -> int:
+def guarded(program: str, run: Callable[[], int]) -> int:
     """Run a worker's share; where it fails alone end at once, so that the others learn of it."""
     try:
         code = run()
@@ -149,7 +150,7 @@ def guarded(run: Callable[[], int]) -> int:
         lost = any(transport in str(error) for transport in ("Gloo", "NCCL", "oordination"))
         # A value that never came is a ValueError to whoever looks at it.
         if isinstance(error, jax.errors.JaxRuntimeError | ValueError) and lost:
-            streams.complain(GONE)
+            streams.complain(f"{program}: {GONE}")
         else:
             streams.complain(traceback.format_exc().rstrip())
         streams.flush()

@@ -49,7 +49,7 @@ class Snapshot(NamedTuple):
     record: dict[str, np.ndarray]
 
 
-class Keeper:
+class Checkpointer:
     """Keeps one cell's training while it runs.
 
     Saving goes on in the background, one checkpoint at a time; leaving the context waits for it. A
@@ -80,7 +80,7 @@ class Keeper:
         self._pending: concurrent.futures.Future[None] | None = None
         self._due = time.monotonic() + every
 
-    def __enter__(self) -> "Keeper":
+    def __enter__(self) -> "Checkpointer":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -135,7 +135,7 @@ class Keeper:
             ) from error
         return None
 
-    def visit(self, step: int, take: Callable[[], tuple[Any, dict[str, np.ndarray]]]) -> None:
+    def save_if_due(self, step: int, take: Callable[[], tuple[Any, dict[str, np.ndarray]]]) -> None:
         """Save if it is time or a signal came.
 
         Args:

@@ -32,29 +32,29 @@ _NOT_COMPARED = (
 )
 
 
-def describe(grid: StudyConfig) -> dict[str, Any]:
+def describe(config: StudyConfig) -> dict[str, Any]:
     """The fully resolved configuration as JSON values."""
-    config = dataclasses.asdict(grid)
-    if grid.demos is not None:
+    described = dataclasses.asdict(config)
+    if config.demos is not None:
         # Another file under the same name is another configuration.
-        with grid.demos.open("rb") as file:
-            config["demos_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
-    return _plain(config)
+        with config.demos.open("rb") as file:
+            described["demos_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+    return _plain(described)
 
 
-def check(grid: StudyConfig) -> None:
+def check(config: StudyConfig) -> None:
     """See that the run can use its folder, which need not be there yet; writes nothing.
 
     Raises:
         UserError: if it cannot be written, holds a run of another configuration, or what is no run.
     """
-    folder = grid.folder
+    folder = config.folder
     path = folder / "config.json"
     if not str(folder).isprintable():
         raise UserError(f"--out: {str(folder)!r} cannot be printed; give a plainer name")
     try:
         if path.exists():
-            _compare(path, describe(grid))
+            _compare(path, describe(config))
         elif folder.is_dir():
             _check_nothing_else_in(folder)
         for name in FOLDERS:
@@ -79,7 +79,7 @@ def _check_nothing_else_in(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def opened(grid: StudyConfig) -> Iterator[Path]:
+def opened(config: StudyConfig) -> Iterator[Path]:
     """The run's folder with its config.json, held against other processes while in use.
 
     A `UserError` before the first cell is finished leaves what was there before, and nothing else.
@@ -87,8 +87,8 @@ def opened(grid: StudyConfig) -> Iterator[Path]:
     Raises:
         UserError: as `check`, and if another process holds the folder.
     """
-    check(grid)
-    folder = grid.folder
+    check(config)
+    folder = config.folder
     made = [path for path in (folder, *folder.absolute().parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -98,10 +98,10 @@ def opened(grid: StudyConfig) -> Iterator[Path]:
     with _held(folder):
         try:
             # Once more: another process may have been here since.
-            check(grid)
+            check(config)
             sealing.finished(folder)
             _clean(folder)
-            _configure(grid)
+            _configure(config)
             yield folder
         except UserError:
             if not sealing.begun(folder):
@@ -148,12 +148,12 @@ def _remove(paths: Iterable[Path]) -> None:
             path.unlink(missing_ok=True)
 
 
-def _configure(grid: StudyConfig) -> None:
-    path = grid.folder / "config.json"
+def _configure(config: StudyConfig) -> None:
+    path = config.folder / "config.json"
     if not path.exists():
-        config = {"schema": SCHEMA, "config": describe(grid), "versions": versions()}
+        described = {"schema": SCHEMA, "config": describe(config), "versions": versions()}
         with sealing.replacing(path) as partial:
-            partial.write_text(json.dumps(config, indent=2) + "\n")
+            partial.write_text(json.dumps(described, indent=2) + "\n")
 
 
 def versions() -> dict[str, str]:
@@ -168,16 +168,16 @@ def other_versions(folder: Path) -> dict[str, str]:
     return {name: version for name, version in began.items() if now.get(name) != version}
 
 
-def identity(grid: StudyConfig) -> dict[str, Any]:
+def identity(config: StudyConfig) -> dict[str, Any]:
     """What a checkpoint must share with a run that goes on from it."""
     compared = {
-        name: value for name, value in _flat(describe(grid)).items() if name not in _NOT_COMPARED
+        name: value for name, value in _flat(describe(config)).items() if name not in _NOT_COMPARED
     }
     digest = hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()
     return {"config": digest, **versions()}
 
 
-def _compare(path: Path, config: dict[str, Any]) -> None:
+def _compare(path: Path, described: dict[str, Any]) -> None:
     try:
         written = json.loads(path.read_text())
         schema, before = written["schema"], _flat(written["config"])
@@ -187,7 +187,7 @@ def _compare(path: Path, config: dict[str, Any]) -> None:
         raise UserError(f"--out: {path} is not a readable configuration ({error})") from error
     if schema != SCHEMA:
         raise UserError(f"--out: {path} has schema {schema!r}, this version writes {SCHEMA}")
-    now = _flat(config)
+    now = _flat(described)
     for name in sorted(before.keys() | now.keys()):
         if name not in _NOT_COMPARED and before.get(name) != now.get(name):
             raise UserError(
@@ -206,9 +206,9 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flat(nested: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     flat = {}
-    for name, value in config.items():
+    for name, value in nested.items():
         if isinstance(value, dict):
             flat |= _flat(value, "" if name == "settings" else f"{prefix}{name}.")
         else:

@@ -14,12 +14,12 @@ from cmedirl_jax.agents.ddpg import DDPGHParams
 from cmedirl_jax.io import checkpoint
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells import cell as cell_lib
-from cmedirl_jax.runs.cells import compiled as programs_lib
+from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells.cell import CellResult, Progress
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.console.signals import Interrupted, Interruption
-from cmedirl_jax.runs.storage.checkpoints import Keeper
+from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.training import Log
 from cmedirl_jax.training.methods import METHODS, Settings
 from cmedirl_jax.training.schedules import Schedule
@@ -66,12 +66,12 @@ def programs(env):
         schedule=Schedule(batch_size=4, learning_starts=LEARNING_STARTS),
     )
     devices = jax.devices()[:1]
-    return programs_lib.compile_method(
+    return compiled_lib.compile_method(
         short,
         METHODS["ddpg"],
         settings,
         evaluator_lib.of_networks(short, settings.architecture, 2, devices),
-        programs_lib.compile_networks(short, settings.architecture, 2, devices),
+        compiled_lib.compile_networks(short, settings.architecture, 2, devices),
         group=2,
         seeds_count=SEEDS,
         devices=devices,
@@ -86,7 +86,7 @@ def train(
     *,
     threshold=0.0,
     before_chunk=lambda state, first_step: state,
-    keeper=None,
+    checkpointer=None,
 ):
     chunks, reports, seed_keys = [], [], []
 
@@ -94,12 +94,12 @@ def train(
         keys = [key.tobytes() for key in np.asarray(jax.random.key_data(state.key))]
         if not seed_keys:
             seed_keys.extend(keys)
-        # Seeds change their lanes, never their keys.
-        lanes = [keys.index(key) for key in seed_keys]
+        # Seeds change their slots, never their keys.
+        slots = [keys.index(key) for key in seed_keys]
         state = before_chunk(state, int(steps[0]))
         state, log = programs.run(state, groups, data, steps, limit)
         # Copies: the next call is given the state to overwrite.
-        of_seeds = jax.tree.map(lambda leaf: np.array(leaf)[lanes], (log, state.agent.actor))
+        of_seeds = jax.tree.map(lambda leaf: np.array(leaf)[slots], (log, state.agent.actor))
         chunks.append(Chunk(np.array(steps), *of_seeds, groups))
         return state, log
 
@@ -114,7 +114,7 @@ def train(
             budget=budget,
             threshold=threshold,
             report=reports.append,
-            keeper=keeper,
+            checkpointer=checkpointer,
         )
     return Trained(result, chunks, reports)
 
@@ -179,7 +179,7 @@ def assert_same(one, another):
 
 
 def mean_return(programs, actor, starts):
-    return np.asarray(programs.judge.on_starts(actor, starts).episode_return).mean(axis=1)
+    return np.asarray(programs.evaluator.on_starts(actor, starts).episode_return).mean(axis=1)
 
 
 def test_every_seed_is_first_evaluated_at_step_0_before_any_update(by_steps):
@@ -320,7 +320,7 @@ def test_groups_without_a_running_seed_are_not_stepped(programs, by_steps, by_ep
     assert [chunk.groups for chunk in trained.chunks] == [-(-count // 2) for count in running]
     assert episode_rows(trained.result) == episode_rows(by_episodes.result)
     assert_same(trained.result.final, by_episodes.result.final)
-    # Neither fewer groups nor seeds in other lanes compile again.
+    # Neither fewer groups nor seeds in other slots compile again.
     assert programs.run._cache_size() <= 2, "with a limit of episodes and without"
 
 
@@ -407,19 +407,19 @@ def assert_whole(line):
     assert "goes on from its checkpoint at step" in line
 
 
-def keeper(folder, *, stop_after=None):
+def checkpointer(folder, *, stop_after=None):
     """Saves every chunk; a signal comes during the chunk that follows `stop_after` others."""
     interruption = Interruption()
-    keeper = Keeper(folder, {}, every=0.0, interruption=interruption, say=assert_whole)
-    visit, visits = keeper.visit, itertools.count()
+    checkpointer = Checkpointer(folder, {}, every=0.0, interruption=interruption, say=assert_whole)
+    save_if_due, visits = checkpointer.save_if_due, itertools.count()
 
     def visit_and_count(step, take):
         if next(visits) == stop_after:
             interruption.signal = signal.SIGTERM
-        visit(step, take)
+        save_if_due(step, take)
 
-    keeper.visit = visit_and_count
-    return keeper
+    checkpointer.save_if_due = visit_and_count
+    return checkpointer
 
 
 def test_training_goes_on_while_its_past_is_saved(programs, by_episodes, tmp_path, monkeypatch):
@@ -432,19 +432,21 @@ def test_training_goes_on_while_its_past_is_saved(programs, by_episodes, tmp_pat
         save(*arguments)
 
     monkeypatch.setattr(checkpoint, "save", save_late)
-    keeping = keeper(tmp_path)
-    visit, visits = keeping.visit, itertools.count()
+    keeping = checkpointer(tmp_path)
+    save_if_due, visits = keeping.save_if_due, itertools.count()
 
     def visit_once(step, take):
         # A seed ends in each of the chunks that follow.
         if next(visits) == 2:
-            visit(step, take)
+            save_if_due(step, take)
 
-    keeping.visit = visit_once
-    assert_same_results(train(programs, BY_EPISODES, keeper=keeping).result, by_episodes.result)
+    keeping.save_if_due = visit_once
+    assert_same_results(
+        train(programs, BY_EPISODES, checkpointer=keeping).result, by_episodes.result
+    )
     trained.set()
     keeping.wait()
-    rest = train(programs, BY_EPISODES, keeper=keeper(tmp_path))
+    rest = train(programs, BY_EPISODES, checkpointer=checkpointer(tmp_path))
     assert rest.chunks[0].steps[0] == 3 * CHUNK
     assert_same_results(rest.result, by_episodes.result)
 
@@ -463,8 +465,8 @@ def test_a_cell_that_was_stopped_goes_on_to_the_same_result(
 ):
     whole = by_steps if budget is BY_STEPS else by_episodes
     with pytest.raises(Interrupted, match="SIGTERM"):
-        train(programs, budget, keeper=keeper(tmp_path, stop_after=chunks - 1))
-    rest = train(programs, budget, keeper=keeper(tmp_path))
+        train(programs, budget, checkpointer=checkpointer(tmp_path, stop_after=chunks - 1))
+    rest = train(programs, budget, checkpointer=checkpointer(tmp_path))
     assert_same_results(rest.result, whole.result)
     assert rest.reports == whole.reports[chunks:]
     assert [list(chunk.steps) for chunk in rest.chunks] == [
@@ -477,8 +479,8 @@ def test_a_cell_that_was_stopped_after_its_last_chunk_takes_no_more_steps(
 ):
     last = len(by_steps.chunks) - 1
     with pytest.raises(Interrupted):
-        train(programs, BY_STEPS, keeper=keeper(tmp_path, stop_after=last))
-    rest = train(programs, BY_STEPS, keeper=keeper(tmp_path))
+        train(programs, BY_STEPS, checkpointer=checkpointer(tmp_path, stop_after=last))
+    rest = train(programs, BY_STEPS, checkpointer=checkpointer(tmp_path))
     assert_same_results(rest.result, by_steps.result)
     assert not rest.chunks
 
@@ -486,18 +488,18 @@ def test_a_cell_that_was_stopped_after_its_last_chunk_takes_no_more_steps(
 def test_a_cell_goes_on_with_a_seed_that_has_diverged(programs, tmp_path):
     diverge = diverge_at(25, 1)
     whole = train(programs, BY_STEPS, before_chunk=diverge)
-    keeping = keeper(tmp_path, stop_after=2)
+    keeping = checkpointer(tmp_path, stop_after=2)
     with pytest.raises(Interrupted):
-        train(programs, BY_STEPS, before_chunk=diverge, keeper=keeping)
-    rest = train(programs, BY_STEPS, keeper=keeper(tmp_path))
+        train(programs, BY_STEPS, before_chunk=diverge, checkpointer=keeping)
+    rest = train(programs, BY_STEPS, checkpointer=checkpointer(tmp_path))
     assert_same_results(rest.result, whole.result)
 
 
 def test_a_cell_goes_on_in_other_lanes(programs, by_episodes, tmp_path):
     with pytest.raises(Interrupted):
-        train(programs, BY_EPISODES, keeper=keeper(tmp_path, stop_after=3))
-    wider = programs._replace(lanes=programs.lanes + 2)
-    rest = train(wider, BY_EPISODES, keeper=keeper(tmp_path)).result
+        train(programs, BY_EPISODES, checkpointer=checkpointer(tmp_path, stop_after=3))
+    wider = programs._replace(slots=programs.slots + 2)
+    rest = train(wider, BY_EPISODES, checkpointer=checkpointer(tmp_path)).result
     np.testing.assert_array_equal(rest.env_steps, by_episodes.result.env_steps)
     for actual, expected in zip(
         jax.tree.leaves(rest.final), jax.tree.leaves(by_episodes.result.final), strict=True
@@ -508,8 +510,8 @@ def test_a_cell_goes_on_in_other_lanes(programs, by_episodes, tmp_path):
 def test_going_on_does_not_compile_again(programs, tmp_path):
     before = programs.run._cache_size()
     with pytest.raises(Interrupted):
-        train(programs, BY_STEPS, keeper=keeper(tmp_path, stop_after=0))
-    train(programs, BY_STEPS, keeper=keeper(tmp_path))
+        train(programs, BY_STEPS, checkpointer=checkpointer(tmp_path, stop_after=0))
+    train(programs, BY_STEPS, checkpointer=checkpointer(tmp_path))
     assert programs.run._cache_size() == before
 
 

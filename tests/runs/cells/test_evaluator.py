@@ -22,7 +22,7 @@ def nearby(env):
 
 
 @pytest.fixture(scope="module")
-def judge(nearby):
+def evaluator(nearby):
     return evaluator_lib.of_networks(nearby, ARCHITECTURE, GROUP, jax.devices()[:1])
 
 
@@ -53,7 +53,7 @@ def episode(actor, position, params):
     return total, length, reached
 
 
-def test_rollouts_from_the_fixed_starts_match_double_precision(judge, actors, nearby):
+def test_rollouts_from_the_fixed_starts_match_double_precision(evaluator, actors, nearby):
     params = nearby.default_params
     positions = np.linspace(params.start_low, params.start_high, STARTS)
     expected = [
@@ -62,16 +62,16 @@ def test_rollouts_from_the_fixed_starts_match_double_precision(judge, actors, ne
     ]
     returns, lengths, reached = np.moveaxis(np.array(expected), -1, 0)
     assert 0 < reached.sum() < reached.size
-    found = judge.on_starts(actors, STARTS)
+    found = evaluator.on_starts(actors, STARTS)
     np.testing.assert_allclose(found.episode_return, returns, atol=1e-3)
     np.testing.assert_array_equal(found.length, lengths)
     np.testing.assert_array_equal(found.terminated, reached)
 
 
-def test_fresh_starts_are_the_same_for_every_seed_and_follow_the_key(judge, actors):
+def test_fresh_starts_are_the_same_for_every_seed_and_follow_the_key(evaluator, actors):
     same = jax.tree.map(lambda leaf: leaf[:1].repeat(SEEDS, 0), actors)
     first, again, other = (
-        np.asarray(judge.on_fresh_starts(same, jax.random.key(key), STARTS).episode_return)
+        np.asarray(evaluator.on_fresh_starts(same, jax.random.key(key), STARTS).episode_return)
         for key in (0, 0, 1)
     )
     np.testing.assert_array_equal(first, first[:1].repeat(SEEDS, 0))

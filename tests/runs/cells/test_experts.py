@@ -151,7 +151,7 @@ def make_pool(env, monkeypatch):
             env,
             ExpertSettings(seeds=STRENGTHS.size, steps=500, trajectories=trajectories),
             "all",
-            types.SimpleNamespace(judge=types.SimpleNamespace(act=act)),
+            types.SimpleNamespace(evaluator=types.SimpleNamespace(act=act)),
             lambda progress: None,
         )
 

@@ -17,9 +17,9 @@ def test_policies_return_in_gymnasium_what_they_return_in_jax(env, spec):
         "Dense_1": {"kernel": np.array([[5.0], [-5.0]]), "bias": np.array([0.01])},
     }
     actors = jax.tree.map(lambda *leaves: np.stack(leaves), actor, {"params": layers})
-    judge = evaluator_lib.of_networks(env, ARCHITECTURE, 2, jax.devices()[:1])
+    evaluator = evaluator_lib.of_networks(env, ARCHITECTURE, 2, jax.devices()[:1])
 
-    found = gymnasium_replay.replay(judge, actors, env)
+    found = gymnasium_replay.replay(evaluator, actors, env)
 
     assert found.gymnasium_return.shape == (2, gymnasium_replay.STARTS)
     np.testing.assert_allclose(found.gymnasium_return, found.jax_return, atol=1e-3)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from cmedirl_jax.irl import RewardInfo
-from cmedirl_jax.runs.cells.record import Book, Budget, Means
+from cmedirl_jax.runs.cells.record import Budget, Means, Record
 from cmedirl_jax.training import Log
 from cmedirl_jax.training.evaluation import Evaluation
 
@@ -33,13 +33,13 @@ def log(start, *, done=(), learned=(), reward_learned=()):
 
 
 def test_means_are_over_the_updates_of_each_kind_since_the_last_evaluation():
-    book = Book(SEEDS, BUDGET)
-    book.stepped(np.arange(STEPS), log(0, learned=[1, 3], reward_learned=[2, 4, 5]))
-    book.evaluated("episodes", np.array([1]), FOUND)
-    book.evaluated("steps", np.arange(SEEDS), FOUND)
-    book.stepped(STEPS + np.arange(STEPS), log(STEPS, learned=[0]))
-    book.evaluated("steps", np.arange(SEEDS), FOUND)
-    by_episodes, first, second = (found.means for found in book.evaluations)
+    record = Record(SEEDS, BUDGET)
+    record.stepped(np.arange(STEPS), log(0, learned=[1, 3], reward_learned=[2, 4, 5]))
+    record.evaluated("episodes", np.array([1]), FOUND)
+    record.evaluated("steps", np.arange(SEEDS), FOUND)
+    record.stepped(STEPS + np.arange(STEPS), log(STEPS, learned=[0]))
+    record.evaluated("steps", np.arange(SEEDS), FOUND)
+    by_episodes, first, second = (found.means for found in record.evaluations)
     reward = np.mean([2, 4, 5])
     np.testing.assert_allclose(
         np.stack(first),
@@ -55,22 +55,22 @@ def test_means_are_over_the_updates_of_each_kind_since_the_last_evaluation():
 
 
 def test_what_a_seed_does_past_its_last_episode_is_not_its_own():
-    book = Book(SEEDS, BUDGET)
-    book.stepped(np.arange(STEPS), log(0, done=[1, 3], learned=range(6), reward_learned=range(6)))
-    book.evaluated("steps", np.arange(SEEDS), FOUND)
-    (found,) = book.evaluations
+    record = Record(SEEDS, BUDGET)
+    record.stepped(np.arange(STEPS), log(0, done=[1, 3], learned=range(6), reward_learned=range(6)))
+    record.evaluated("steps", np.arange(SEEDS), FOUND)
+    (found,) = record.evaluations
     assert found.env_step.tolist() == [4, 6]
     assert found.means.q_mean.tolist() == [np.mean(range(4)), 100 + np.mean(range(6))]
     assert found.means.demonstration_reward[0] == pytest.approx(np.mean(range(4)))
-    assert book.running.tolist() == [False, True]
+    assert record.running.tolist() == [False, True]
 
 
 def test_a_method_that_learns_no_reward_has_none_of_its_means():
-    book = Book(SEEDS, BUDGET)
+    record = Record(SEEDS, BUDGET)
     chunk = log(0, learned=[1], reward_learned=[1])._replace(reward=None)
-    book.stepped(np.arange(STEPS), chunk)
-    book.evaluated("steps", np.arange(SEEDS), FOUND)
-    means = book.evaluations[0].means
+    record.stepped(np.arange(STEPS), chunk)
+    record.evaluated("steps", np.arange(SEEDS), FOUND)
+    means = record.evaluations[0].means
     assert Means._fields[2:] == (
         "demonstration_reward",
         "background_reward",

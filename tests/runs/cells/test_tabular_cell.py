@@ -8,7 +8,7 @@ from cmedirl_jax import tabular
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.runs.cells import tabular_cell
 from cmedirl_jax.runs.console.signals import Interrupted, Interruption
-from cmedirl_jax.runs.storage.checkpoints import Keeper
+from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.imitation import TabularSettings
 from cmedirl_jax.training import evaluation
@@ -30,7 +30,7 @@ def programs(env):
     )
 
 
-def train(programs, seeds_count, n_demos=2, keeper=None):
+def train(programs, seeds_count, n_demos=2, checkpointer=None):
     data = hot_start.data(pools.scripted())
     return tabular_cell.train(
         programs,
@@ -39,7 +39,7 @@ def train(programs, seeds_count, n_demos=2, keeper=None):
         n_demos,
         seeds_count=seeds_count,
         evaluation_starts=2,
-        keeper=keeper,
+        checkpointer=checkpointer,
     )
 
 
@@ -74,16 +74,16 @@ def test_a_cell_that_was_stopped_goes_on_with_the_seeds_that_are_left(
         calls.append(arguments)
         return programs.fit(*arguments)
 
-    def keeper(interruption):
-        return Keeper(
+    def checkpointer(interruption):
+        return Checkpointer(
             tmp_path / "cell", {}, every=0.0, interruption=interruption, say=lambda line: None
         )
 
     listening = programs._replace(fit=fit)
     with pytest.raises(Interrupted):
-        train(listening, SEEDS, keeper=keeper(interruption))
+        train(listening, SEEDS, checkpointer=checkpointer(interruption))
     assert len(calls) == fitted
-    found = train(programs, SEEDS, keeper=keeper(Interruption()))
+    found = train(programs, SEEDS, checkpointer=checkpointer(Interruption()))
     for actual, expected in zip(jax.tree.leaves(found), jax.tree.leaves(result), strict=True):
         np.testing.assert_array_equal(actual, expected)
 

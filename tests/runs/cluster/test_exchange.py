@@ -220,7 +220,7 @@ def test_stopped_together_or_bereaved_they_go_on_to_what_one_process_gives(
         # The first cell is finished; it dies in the second.
         run.running[1].kill()
         assert run.codes(60) == [1, -signal.SIGKILL]
-        assert run.output(0).splitlines()[-1] == processes.GONE
+        assert run.output(0).splitlines()[-1] == f"run_grid: {processes.GONE}"
         assert "Traceback" not in run.output(0)
     assert not (folder / "summary.csv").exists()
 
@@ -241,7 +241,7 @@ def test_the_death_of_the_writer_ends_the_others_too(together):
         wait_for(run, lambda: "[1/2] me-ddpg-n1" in run.output(0))
         run.running[0].kill()
         assert run.codes(60) == [-signal.SIGKILL, 1]
-        assert processes.GONE in run.output(1).splitlines()
+        assert f"run_grid: {processes.GONE}" in run.output(1).splitlines()
 
 
 def test_processes_that_a_cluster_starts_find_each_other_and_refuse_together(compiled, tmp_path):

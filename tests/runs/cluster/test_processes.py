@@ -28,7 +28,7 @@ def failing(error):
 
 def test_a_process_that_fails_alone_says_why_and_ends_at_once(ended, capsys):
     with pytest.raises(Ended, match="1"):
-        processes.guarded(failing(ZeroDivisionError("by nothing")))
+        processes.guarded("run_grid", failing(ZeroDivisionError("by nothing")))
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "Traceback (most recent call last):"
     assert lines[-1] == "ZeroDivisionError: by nothing"
@@ -44,18 +44,18 @@ def test_a_process_that_fails_alone_says_why_and_ends_at_once(ended, capsys):
 )
 def test_a_process_that_lost_another_says_so_and_ends_at_once(ended, capsys, error):
     with pytest.raises(Ended, match="1"):
-        processes.guarded(failing(error))
-    assert capsys.readouterr().err == processes.GONE + "\n"
+        processes.guarded("run_grid", failing(error))
+    assert capsys.readouterr().err == f"run_grid: {processes.GONE}\n"
 
 
 def test_a_process_that_could_not_write_ends_at_once(ended):
     with pytest.raises(Ended, match="1"):
-        processes.guarded(lambda: 1)
+        processes.guarded("run_grid", lambda: 1)
 
 
 @pytest.mark.parametrize("code", [0, 2, 130, 143])
 def test_what_all_agree_on_is_returned(ended, code):
-    assert processes.guarded(lambda: code) == code
+    assert processes.guarded("run_grid", lambda: code) == code
 
 
 class Child:
@@ -79,7 +79,7 @@ def supervised(monkeypatch):
 
     def supervise(child):
         monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: child)
-        return processes.supervise([])
+        return processes.supervise("experiments.run_grid", [])
 
     yield supervise
     for number, handler in before.items():
@@ -96,7 +96,7 @@ def test_a_parent_passes_signals_on_and_returns_what_comes_of_them(supervised, c
 @pytest.mark.parametrize(
     ("code", "shown", "line"),
     [
-        (-signal.SIGABRT, 1, processes.GONE),
+        (-signal.SIGABRT, 1, f"run_grid: {processes.GONE}"),
         (-signal.SIGSEGV, 139, "run_grid: ended by SIGSEGV"),
         (-signal.SIGKILL, 137, "run_grid: ended by SIGKILL"),
     ],

@@ -20,7 +20,7 @@ from cmedirl_jax.io import checkpoint
 from cmedirl_jax.runs.console.signals import Interrupted, Interruption
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import checkpoints
-from cmedirl_jax.runs.storage.checkpoints import Keeper
+from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 
 
 class State(NamedTuple):
@@ -61,8 +61,8 @@ class Kept(NamedTuple):
     lines: list
     interruption: Interruption
 
-    def keeper(self, *, every=0.0, **identity):
-        return Keeper(
+    def checkpointer(self, *, every=0.0, **identity):
+        return Checkpointer(
             self.folder,
             {"jax": "1.0", **identity},
             every=every,
@@ -71,10 +71,10 @@ class Kept(NamedTuple):
         )
 
     def save(self, *steps, **identity):
-        keeper = self.keeper(**identity)
+        checkpointer = self.checkpointer(**identity)
         for step in steps:
-            keeper.visit(step, lambda step=step: (state_at(step), record_at(step)))
-        keeper.wait()
+            checkpointer.save_if_due(step, lambda step=step: (state_at(step), record_at(step)))
+        checkpointer.wait()
 
     def names(self):
         return sorted(path.name for path in self.folder.iterdir())
@@ -87,15 +87,15 @@ def kept(tmp_path):
 
 def test_the_newest_checkpoint_is_loaded_as_it_was_saved(kept):
     kept.save(250, 500)
-    assert_is(kept.keeper().load(like), 500)
+    assert_is(kept.checkpointer().load(like), 500)
     assert kept.lines == ["cell goes on from its checkpoint at step 500"]
 
 
 def test_without_a_checkpoint_there_is_nothing_to_load(kept):
-    assert kept.keeper().load(like) is None
+    assert kept.checkpointer().load(like) is None
     kept.folder.mkdir()
     (kept.folder / "note").touch()
-    assert kept.keeper().load(like) is None
+    assert kept.checkpointer().load(like) is None
 
 
 def test_the_last_two_are_kept(kept):
@@ -104,37 +104,37 @@ def test_the_last_two_are_kept(kept):
 
 
 def test_a_cell_that_is_finished_keeps_none(kept):
-    keeper = kept.keeper()
-    keeper.visit(5, lambda: (state_at(5), record_at(5)))
-    keeper.remove()
+    checkpointer = kept.checkpointer()
+    checkpointer.save_if_due(5, lambda: (state_at(5), record_at(5)))
+    checkpointer.remove()
     assert not kept.folder.exists()
 
 
 def test_nothing_is_saved_before_its_time(kept):
-    keeper = kept.keeper(every=0.2)
-    keeper.visit(1, lambda: pytest.fail("too early"))
+    checkpointer = kept.checkpointer(every=0.2)
+    checkpointer.save_if_due(1, lambda: pytest.fail("too early"))
     time.sleep(0.25)
-    keeper.visit(2, lambda: (state_at(2), record_at(2)))
-    keeper.visit(3, lambda: pytest.fail("too early again"))
-    keeper.wait()
+    checkpointer.save_if_due(2, lambda: (state_at(2), record_at(2)))
+    checkpointer.save_if_due(3, lambda: pytest.fail("too early again"))
+    checkpointer.wait()
     assert kept.names() == ["2"]
 
 
 def test_a_signal_is_obeyed_once_all_is_saved(kept):
-    keeper = kept.keeper(every=1e6)
+    checkpointer = kept.checkpointer(every=1e6)
     kept.interruption.signal = 15
     with pytest.raises(Interrupted):
-        keeper.visit(4, lambda: (state_at(4), record_at(4)))
-    assert_is(kept.keeper().load(like), 4)
+        checkpointer.save_if_due(4, lambda: (state_at(4), record_at(4)))
+    assert_is(kept.checkpointer().load(like), 4)
 
 
 def test_checkpoints_are_saved_one_at_a_time_and_in_order(kept):
-    keeper = kept.keeper()
+    checkpointer = kept.checkpointer()
     for step in range(20):
-        keeper.visit(step, lambda step=step: (state_at(step), record_at(step)))
-    keeper.wait()
+        checkpointer.save_if_due(step, lambda step=step: (state_at(step), record_at(step)))
+    checkpointer.wait()
     assert kept.names() == ["18", "19"]
-    assert_is(kept.keeper().load(like), 19)
+    assert_is(kept.checkpointer().load(like), 19)
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +174,7 @@ def test_a_damaged_checkpoint_is_reported_and_the_one_before_is_loaded(saved, tm
             path.unlink()
         case _:
             path.write_bytes(content + b"x")
-    found = kept.keeper().load(like)
+    found = kept.checkpointer().load(like)
     if found.step == 500:
         # Only where the manifest still says the same: a changed blank between its values.
         assert path.name == "manifest.json"
@@ -189,7 +189,7 @@ def test_where_all_are_damaged_training_begins_anew(kept):
     kept.save(250, 500)
     for step in ("250", "500"):
         (kept.folder / step / "record.npz").write_bytes(b"")
-    assert kept.keeper().load(like) is None
+    assert kept.checkpointer().load(like) is None
     assert len(kept.lines) == 2
     assert not kept.names()
 
@@ -202,11 +202,11 @@ def test_a_checkpoint_cut_off_while_it_was_written_is_not_seen(kept, monkeypatch
         raise KeyboardInterrupt
 
     monkeypatch.setattr(checkpoint, "save", cut_off)
-    keeper = kept.keeper()
-    keeper.visit(500, lambda: (state_at(500), record_at(500)))
+    checkpointer = kept.checkpointer()
+    checkpointer.save_if_due(500, lambda: (state_at(500), record_at(500)))
     with pytest.raises(KeyboardInterrupt):
-        keeper.wait()
-    assert_is(kept.keeper().load(like), 250)
+        checkpointer.wait()
+    assert_is(kept.checkpointer().load(like), 250)
 
 
 def test_what_an_earlier_process_left_unfinished_is_in_nobodys_way(kept):
@@ -225,13 +225,13 @@ def test_what_an_earlier_process_left_unfinished_is_in_nobodys_way(kept):
 def test_another_version_is_refused_and_the_checkpoints_stay(kept, identity, line):
     kept.save(250, 500)
     with pytest.raises(UserError, match=line):
-        kept.keeper(**identity).load(like)
+        kept.checkpointer(**identity).load(like)
     assert kept.names() == ["250", "500"]
 
 
 def test_another_structure_begins_anew_and_says_so(kept):
     kept.save(250)
-    assert kept.keeper().load(lambda record: {"other": jnp.zeros(3)}) is None
+    assert kept.checkpointer().load(lambda record: {"other": jnp.zeros(3)}) is None
     assert "holds another structure" in kept.lines[0]
 
 
@@ -245,14 +245,14 @@ def test_another_schema_is_refused_and_kept(kept, schema):
     manifest["schema"] = schema
     path.write_text(json.dumps({**manifest, "sha256": checkpoints._digest_of(manifest)}))
     with pytest.raises(UserError, match=f"has schema {schema}, this version reads 2"):
-        kept.keeper().load(like)
+        kept.checkpointer().load(like)
     assert kept.names() == ["250"]
 
 
 def test_a_checkpoint_that_was_renamed_is_not_of_its_step(kept):
     kept.save(250, 500)
     (kept.folder / "500").rename(kept.folder / "1500")
-    assert_is(kept.keeper().load(like), 250)
+    assert_is(kept.checkpointer().load(like), 250)
     assert kept.lines[0].startswith(f"{kept.folder / '1500'} is damaged (it is of step 500)")
 
 
@@ -279,11 +279,11 @@ def test_a_checkpoint_that_cannot_be_read_for_now_is_refused_and_kept(
     with monkeypatch.context() as patch:
         patch.setattr(*UNREADABLE[what], fail)
         with pytest.raises(UserError) as refused:
-            kept.keeper().load(like)
+            kept.checkpointer().load(like)
     line = f"--out: cannot use the file ({os.strerror(number)}); the checkpoints are kept"
     assert str(refused.value) == line
     assert kept.names() == ["250", "500"]
-    assert_is(kept.keeper().load(like), 500)
+    assert_is(kept.checkpointer().load(like), 500)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="nothing is closed to this user")
@@ -293,7 +293,7 @@ def test_a_folder_that_is_closed_to_the_user_is_not_damaged(kept):
     state.chmod(0)
     try:
         with pytest.raises(UserError, match="Permission denied"):
-            kept.keeper().load(like)
+            kept.checkpointer().load(like)
     finally:
         state.chmod(0o700)
     assert kept.names() == ["250"]
@@ -303,10 +303,10 @@ def test_what_is_called_like_a_step_and_is_no_folder_is_left_alone(kept):
     kept.save(250, 500)
     (kept.folder / "99999").touch()
     (kept.folder / "88888").symlink_to(kept.folder / "250")
-    assert_is(kept.keeper().load(like), 500)
+    assert_is(kept.checkpointer().load(like), 500)
     kept.save(750, 88888, 99999)
     assert kept.names() == ["500", "750", "88888", "99999"]
-    assert_is(kept.keeper().load(like), 750)
+    assert_is(kept.checkpointer().load(like), 750)
     reports = [line for line in kept.lines if line.startswith("no checkpoint could be saved")]
     assert len(reports) == 2
 
@@ -315,15 +315,15 @@ def test_a_full_disk_is_reported_and_training_goes_on(kept, monkeypatch):
     kept.save(250)
     usage = shutil.disk_usage(kept.folder)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=10))
-    keeper = kept.keeper()
-    keeper.visit(500, lambda: (state_at(500), record_at(500)))
-    keeper.wait()
+    checkpointer = kept.checkpointer()
+    checkpointer.save_if_due(500, lambda: (state_at(500), record_at(500)))
+    checkpointer.wait()
     assert kept.lines == [
         f"no checkpoint could be saved in {kept.folder} (No space left on device)"
     ]
     monkeypatch.undo()
-    keeper.visit(750, lambda: (state_at(750), record_at(750)))
-    keeper.wait()
+    checkpointer.save_if_due(750, lambda: (state_at(750), record_at(750)))
+    checkpointer.wait()
     assert kept.names() == ["250", "750"]
 
 
@@ -333,11 +333,11 @@ def test_a_write_that_fails_under_orbaxs_hands_is_reported_and_training_goes_on(
     kept.save(250)
     large = {"weights": np.random.default_rng(0).random(2**18)}
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    keeper = kept.keeper()
+    checkpointer = kept.checkpointer()
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**20, before[1]))
     try:
-        keeper.visit(500, lambda: (large, {}))
-        keeper.wait()
+        checkpointer.save_if_due(500, lambda: (large, {}))
+        checkpointer.wait()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         gc.collect()
@@ -348,8 +348,8 @@ def test_a_write_that_fails_under_orbaxs_hands_is_reported_and_training_goes_on(
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("state", [{"weights": object()}, {"weights": np.zeros(0)}])
 def test_what_can_never_be_saved_is_an_error(kept, state):
-    keeper = kept.keeper()
-    keeper.visit(250, lambda: (state, {}))
+    checkpointer = kept.checkpointer()
+    checkpointer.save_if_due(250, lambda: (state, {}))
     with pytest.raises((AttributeError, ValueError)):
-        keeper.wait()
+        checkpointer.wait()
     gc.collect()

@@ -17,7 +17,7 @@ from tests.support import damages
 
 
 @pytest.fixture
-def grid(tmp_path):
+def config(tmp_path):
     return StudyConfig(out=tmp_path / "run")
 
 
@@ -26,9 +26,9 @@ def contents(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def opened(grid):
+def opened(config):
     """Enter the run's folder and leave it; returns the folder."""
-    with run_folder.opened(grid) as folder:
+    with run_folder.opened(config) as folder:
         return folder
 
 
@@ -36,8 +36,8 @@ def test_configuration_is_strict_json_with_versions(tmp_path):
     settings = dataclasses.replace(
         PRESETS["paper"].settings, reward=IRLHParams(gauge_rate=math.inf)
     )
-    grid = dataclasses.replace(PRESETS["paper"], out=tmp_path, settings=settings)
-    with run_folder.opened(grid) as folder:
+    config = dataclasses.replace(PRESETS["paper"], out=tmp_path, settings=settings)
+    with run_folder.opened(config) as folder:
         text = (folder / "config.json").read_text()
     written = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert written["schema"] == run_folder.SCHEMA
@@ -49,10 +49,10 @@ def test_configuration_is_strict_json_with_versions(tmp_path):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_same_configuration_enters_again_and_changes_nothing(preset, tmp_path):
-    grid = dataclasses.replace(PRESETS[preset], out=tmp_path)
-    opened(grid)
+    config = dataclasses.replace(PRESETS[preset], out=tmp_path)
+    opened(config)
     before = contents(tmp_path)
-    assert opened(grid) == tmp_path
+    assert opened(config) == tmp_path
     assert contents(tmp_path) == before
 
 
@@ -69,21 +69,21 @@ def test_the_same_configuration_enters_again_and_changes_nothing(preset, tmp_pat
         ),
     ],
 )
-def test_another_configuration_is_refused_naming_the_option_and_both_values(grid, change, named):
-    folder = opened(grid)
+def test_another_configuration_is_refused_naming_the_option_and_both_values(config, change, named):
+    folder = opened(config)
     before = contents(folder)
     with pytest.raises(UserError) as error:
-        opened(dataclasses.replace(grid, **change))
+        opened(dataclasses.replace(config, **change))
     assert str(error.value).startswith("--out: ")
     assert named in str(error.value)
     assert "\n" not in str(error.value)
     assert contents(folder) == before
 
 
-def test_the_folders_spelling_and_the_devices_are_not_compared(grid, monkeypatch):
-    folder = opened(grid)
+def test_the_folders_spelling_and_the_devices_are_not_compared(config, monkeypatch):
+    folder = opened(config)
     monkeypatch.chdir(folder.parent)
-    respelled = dataclasses.replace(grid, out=Path(folder.name), devices=2)
+    respelled = dataclasses.replace(config, out=Path(folder.name), devices=2)
     assert opened(respelled).samefile(folder)
 
 
@@ -102,11 +102,11 @@ def test_the_folders_spelling_and_the_devices_are_not_compared(grid, monkeypatch
         b'{"schema": 1, "config": {}, "versions": []}',
     ],
 )
-def test_a_damaged_or_newer_configuration_is_refused_and_kept(grid, damaged):
-    path = opened(grid) / "config.json"
+def test_a_damaged_or_newer_configuration_is_refused_and_kept(config, damaged):
+    path = opened(config) / "config.json"
     path.write_bytes(damaged)
     with pytest.raises(UserError, match=r"^--out: .*config\.json"):
-        opened(grid)
+        opened(config)
     assert path.read_bytes() == damaged
 
 
@@ -119,20 +119,20 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path, below):
     assert contents(tmp_path) == {file: b"kept"}
 
 
-def test_a_folder_that_holds_something_else_is_refused_and_left_alone(grid):
-    (grid.folder / "checkpoints").mkdir(parents=True)
-    (grid.folder / "checkpoints" / "model.bin").write_bytes(b"somebody's")
-    before = contents(grid.folder)
+def test_a_folder_that_holds_something_else_is_refused_and_left_alone(config):
+    (config.folder / "checkpoints").mkdir(parents=True)
+    (config.folder / "checkpoints" / "model.bin").write_bytes(b"somebody's")
+    before = contents(config.folder)
     with pytest.raises(UserError, match=r"^--out: .* holds checkpoints and no config\.json"):
-        opened(grid)
-    assert contents(grid.folder) == before
+        opened(config)
+    assert contents(config.folder) == before
 
 
-def test_a_folder_whose_run_was_killed_at_once_is_taken(grid):
-    grid.folder.mkdir()
-    (grid.folder / ".lock").touch()
-    (grid.folder / ".config.json.partial").write_text("{")
-    assert {path.name for path in opened(grid).iterdir()} == {".lock", "config.json"}
+def test_a_folder_whose_run_was_killed_at_once_is_taken(config):
+    config.folder.mkdir()
+    (config.folder / ".lock").touch()
+    (config.folder / ".config.json.partial").write_text("{")
+    assert {path.name for path in opened(config).iterdir()} == {".lock", "config.json"}
 
 
 UNFINISHED = (
@@ -148,16 +148,16 @@ def write(folder, names):
         (folder / name).write_text(name)
 
 
-def test_what_a_killed_run_left_is_removed_and_nothing_else(grid):
-    opened(grid)
-    write(grid.folder, (*UNFINISHED, *SOMEBODYS))
-    opened(grid)
-    found = {str(path.relative_to(grid.folder)) for path in contents(grid.folder)}
+def test_what_a_killed_run_left_is_removed_and_nothing_else(config):
+    opened(config)
+    write(config.folder, (*UNFINISHED, *SOMEBODYS))
+    opened(config)
+    found = {str(path.relative_to(config.folder)) for path in contents(config.folder)}
     assert found == {".lock", "config.json", *SOMEBODYS}
 
 
-def refused_at_work(grid, names):
-    with run_folder.opened(grid) as folder:
+def refused_at_work(config, names):
+    with run_folder.opened(config) as folder:
         write(folder, names)
         raise UserError("no expert")
 
@@ -171,27 +171,27 @@ def test_a_refusal_at_work_removes_what_is_the_runs_own(tmp_path, out):
     assert not any(tmp_path.iterdir())
 
 
-def test_a_refusal_at_work_leaves_what_somebody_else_put_there(grid):
+def test_a_refusal_at_work_leaves_what_somebody_else_put_there(config):
     with pytest.raises(UserError, match="no expert"):
-        refused_at_work(grid, ("checkpoints/1", "notes.txt"))
-    assert {path.name for path in contents(grid.folder)} == {"notes.txt"}
+        refused_at_work(config, ("checkpoints/1", "notes.txt"))
+    assert {path.name for path in contents(config.folder)} == {"notes.txt"}
 
 
-def test_a_damaged_table_is_refused_before_anything_is_removed(grid):
-    opened(grid)
-    write(grid.folder, (*UNFINISHED, "seeds.parquet"))
-    before = contents(grid.folder)
+def test_a_damaged_table_is_refused_before_anything_is_removed(config):
+    opened(config)
+    write(config.folder, (*UNFINISHED, "seeds.parquet"))
+    before = contents(config.folder)
     with pytest.raises(UserError, match="damaged table"):
-        opened(grid)
-    assert contents(grid.folder) == before
+        opened(config)
+    assert contents(config.folder) == before
 
 
 @pytest.mark.parametrize("name", run_folder.FOLDERS)
-def test_a_file_where_a_folder_belongs_is_refused(grid, name):
-    opened(grid)
-    (grid.folder / name).touch()
+def test_a_file_where_a_folder_belongs_is_refused(config, name):
+    opened(config)
+    (config.folder / name).touch()
     with pytest.raises(UserError, match=f"^--out: .*{name} is in the way"):
-        opened(grid)
+        opened(config)
 
 
 @pytest.mark.parametrize("name", ["two\nlines", "not\udcffutf-8"])
@@ -204,9 +204,9 @@ def test_a_name_that_cannot_be_printed_is_refused(tmp_path, name):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A run's folder, and its configuration."""
-    grid = StudyConfig(out=tmp_path_factory.mktemp("whole"))
-    opened(grid)
-    return grid
+    config = StudyConfig(out=tmp_path_factory.mktemp("whole"))
+    opened(config)
+    return config
 
 
 @settings(max_examples=100)
