@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax import checks
+from cmedirl_jax.ranges import Count, NotNegative, Size
 from cmedirl_jax.types import EnvSpec, Network, Params
 
 Normalisation = Literal["none", "layer", "batch"]
@@ -52,12 +53,12 @@ class Architecture:
         output_scale: Half-width of the uniform initialisation of the last layer.
     """
 
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[Size, ...] = (64, 64)
     actor_normalisation: Normalisation = "none"
     critic_normalisation: Normalisation = "layer"
     normalise_observation: bool = True
-    action_layer: int = 0
-    output_scale: float = 3e-3
+    action_layer: Count = 0
+    output_scale: NotNegative = 3e-3
 
 
 class MLP(nn.Module):

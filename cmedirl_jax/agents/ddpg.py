@@ -17,6 +17,7 @@ from cmedirl_jax import checks, optimizers
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.networks import ActorCritic
 from cmedirl_jax.optimizers import traced
+from cmedirl_jax.ranges import NotNegative, Positive, PositiveShare, Share
 from cmedirl_jax.types import EnvSpec, Numeric, Params, Transition
 
 
@@ -39,13 +40,13 @@ class DDPGHParams(flax.struct.PyTreeNode):
             printed.
     """
 
-    discount: float = 0.99
-    tau: float = 0.01
-    actor_learning_rate: float = 1e-4
-    critic_learning_rate: float = 1e-3
-    reward_scale: float = 1.0
-    pre_activation_penalty: float = 1e-3
-    behaviour_cloning: float = 0.0
+    discount: Share = 0.99
+    tau: PositiveShare = 0.01
+    actor_learning_rate: NotNegative = 1e-4
+    critic_learning_rate: NotNegative = 1e-3
+    reward_scale: Positive = 1.0
+    pre_activation_penalty: NotNegative = 1e-3
+    behaviour_cloning: NotNegative = 0.0
     q_filter: bool = flax.struct.field(pytree_node=False, default=False)
     bootstrap_at_termination: bool = flax.struct.field(pytree_node=False, default=False)
 

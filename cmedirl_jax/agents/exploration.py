@@ -11,7 +11,7 @@ of any policy about any action and is what mixtures of policies are made of.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import flax.struct
 import jax
@@ -21,6 +21,7 @@ import numpy as np
 from cmedirl_jax import checks
 from cmedirl_jax.agents import densities
 from cmedirl_jax.optimizers import traced
+from cmedirl_jax.ranges import AtLeastOne, NotNegative, Positive, Range, Share
 from cmedirl_jax.types import EnvSpec, Numeric
 
 
@@ -71,7 +72,7 @@ class GaussianHParams(flax.struct.PyTreeNode):
         scale: Standard deviation, in half-widths of the action range.
     """
 
-    scale: float = 0.5
+    scale: NotNegative = 0.5
 
 
 class OrnsteinUhlenbeckHParams(flax.struct.PyTreeNode):
@@ -82,8 +83,8 @@ class OrnsteinUhlenbeckHParams(flax.struct.PyTreeNode):
         sigma: Standard deviation of the innovation, in half-widths of the action range.
     """
 
-    theta: float = 0.15
-    sigma: float = 0.5
+    theta: Annotated[float, Range(0.0, 2.0, "between 0 and 2")] = 0.15
+    sigma: NotNegative = 0.5
 
 
 class EpsilonGreedyHParams(flax.struct.PyTreeNode):
@@ -98,11 +99,11 @@ class EpsilonGreedyHParams(flax.struct.PyTreeNode):
             None for none, as in the paper; that is static, a number is not.
     """
 
-    epsilon_start: float = 1.0
-    epsilon_end: float = 0.01
-    epsilon_steps: float = 5000.0
-    hold: float = 1.0
-    noise: float | None = None
+    epsilon_start: Share = 1.0
+    epsilon_end: Share = 0.01
+    epsilon_steps: AtLeastOne = 5000.0
+    hold: AtLeastOne = 1.0
+    noise: Positive | None = None
 
 
 class OrnsteinUhlenbeckState(flax.struct.PyTreeNode):

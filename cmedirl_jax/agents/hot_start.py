@@ -28,6 +28,7 @@ from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.demonstrations import Demonstrations, DemonstrationSubset
 from cmedirl_jax.networks import ActorCritic
+from cmedirl_jax.ranges import NotNegative, Size
 from cmedirl_jax.types import Array, EnvSpec, Params, Transition
 
 
@@ -44,15 +45,15 @@ class HotStartHParams(flax.struct.PyTreeNode):
         batch_size: Demonstrated steps per gradient step.
     """
 
-    learning_rate: float = 1e-3
-    curvature: float = 20.0
-    margin: float = 0.8
+    learning_rate: NotNegative = 1e-3
+    curvature: NotNegative = 20.0
+    margin: NotNegative = 0.8
     critic: Literal["softmax", "one-hot", "quadratic", "monte-carlo", "large-margin"] = (
         flax.struct.field(pytree_node=False, default="one-hot")
     )
-    cells: int = flax.struct.field(pytree_node=False, default=11)
-    steps: int = flax.struct.field(pytree_node=False, default=1000)
-    batch_size: int = flax.struct.field(pytree_node=False, default=32)
+    cells: Size = flax.struct.field(pytree_node=False, default=11)
+    steps: Size = flax.struct.field(pytree_node=False, default=1000)
+    batch_size: Size = flax.struct.field(pytree_node=False, default=32)
 
 
 class HotStartData(NamedTuple):

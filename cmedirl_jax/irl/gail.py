@@ -16,6 +16,7 @@ from cmedirl_jax import checks, optimizers
 from cmedirl_jax.irl import base, regularisers, rewards
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.optimizers import traced
+from cmedirl_jax.ranges import NotNegative, Positive
 from cmedirl_jax.types import EnvSpec, Network, Params, RewardBatch, Transition
 
 
@@ -30,9 +31,9 @@ class GAILHParams(flax.struct.PyTreeNode):
             either.
     """
 
-    learning_rate: float = 1e-3
-    scale: float = 0.1
-    output_penalty: float = 0.05
+    learning_rate: NotNegative = 1e-3
+    scale: Positive = 0.1
+    output_penalty: NotNegative = 0.05
     form: Literal["-log(1 - D)", "log D", "logit D"] = flax.struct.field(
         pytree_node=False, default="-log(1 - D)"
     )

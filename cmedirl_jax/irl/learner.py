@@ -6,7 +6,7 @@ state, info = jax.jit(learner.update)(state, demonstrations, background)
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import flax.struct
 import jax
@@ -20,6 +20,7 @@ from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.irl.objectives import Likelihood, Objective, Scored
 from cmedirl_jax.irl.regularisers import BoundKind, Gauge
 from cmedirl_jax.optimizers import traced
+from cmedirl_jax.ranges import POSITIVE, NotNegative, Share
 from cmedirl_jax.types import EnvSpec, Network, Numeric, Params, RewardBatch, Transition
 
 
@@ -53,16 +54,21 @@ class IRLHParams(flax.struct.PyTreeNode):
             line 4).
     """
 
-    learning_rate: float = 1e-3
-    bound: float = 0.1
-    output_penalty: float = 0.05
-    prior_precision: float = 0.0
-    gradient_penalty: float | None = None
-    gradient_penalty_target: float = 0.0
-    gauge_rate: float = 0.05
-    discount: float = 1.0
-    weight_exponent: float = 1.0
-    weight_limit: float | None = None
+    learning_rate: NotNegative = 1e-3
+    bound: Annotated[
+        float,
+        POSITIVE._replace(
+            words="positive and finite (for an unbounded reward take reward.bounded_by none)"
+        ),
+    ] = 0.1
+    output_penalty: NotNegative = 0.05
+    prior_precision: NotNegative = 0.0
+    gradient_penalty: NotNegative | None = None
+    gradient_penalty_target: NotNegative = 0.0
+    gauge_rate: Share = 0.05
+    discount: Share = 1.0
+    weight_exponent: NotNegative = 1.0
+    weight_limit: NotNegative | None = None
     objective: Objective = flax.struct.field(pytree_node=False, default="visitation")
     bounded_by: BoundKind = flax.struct.field(pytree_node=False, default="tanh")
     gauge: Gauge = flax.struct.field(pytree_node=False, default="none")

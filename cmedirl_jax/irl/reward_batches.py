@@ -20,6 +20,7 @@ from cmedirl_jax.irl.objectives import Objective
 from cmedirl_jax.irl.sample_sources import SampleSource
 from cmedirl_jax.irl.sample_weights import SampleWeights
 from cmedirl_jax.networks import ActorCritic
+from cmedirl_jax.ranges import Size
 from cmedirl_jax.types import EnvSpec, Params, RewardBatch, Transition
 
 
@@ -44,13 +45,13 @@ class RewardBatchSettings:
             most.
     """
 
-    batch_size: int = 32
-    recent: int | None = 2000
+    batch_size: Size = 32
+    recent: Size | None = 2000
     weights: Literal["uniform", "recorded", "fusion"] = "uniform"
-    snapshots: int = 8
-    snapshot_period: int = 250
-    trajectories: int = 8
-    episodes: int = 32
+    snapshots: Size = 8
+    snapshot_period: Size = 250
+    trajectories: Size = 8
+    episodes: Size = 32
 
 
 class SamplerState(flax.struct.PyTreeNode):

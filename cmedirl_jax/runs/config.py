@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from cmedirl_jax.ranges import Count, NotNegative, Range, Size
 from cmedirl_jax.training.methods import PAPER_METHODS, Settings
 
 Expert = Literal["best", "median", "all"]
@@ -22,9 +23,9 @@ class ExpertSettings:
         trajectories: Least number of demonstrated trajectories in the pool.
     """
 
-    seeds: int = 16
-    steps: int = 14_000
-    trajectories: int = 1_024
+    seeds: Size = 16
+    steps: Size = 14_000
+    trajectories: Size = 1_024
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,26 +68,26 @@ class StudyConfig:
 
     preset: Literal["tuned", "paper", "smoke"] = "tuned"
     methods: tuple[str, ...] = PAPER_METHODS
-    n_demos: tuple[int, ...] = (200,)
-    seeds: int = 100
-    seed: int = 0
-    max_steps: int | None = 12_000
-    max_episodes: int | None = None
-    evaluate_every: int = 250
-    evaluation_starts: int = 10
-    evaluate_every_episodes: int | None = None
-    evaluation_starts_episodes: int = 100
+    n_demos: tuple[Size, ...] = (200,)
+    seeds: Size = 100
+    seed: Annotated[int, Range(0, 2**32 - 1, "between 0 and 2^32 - 1")] = 0
+    max_steps: Size | None = 12_000
+    max_episodes: Size | None = None
+    evaluate_every: Size = 250
+    evaluation_starts: Size = 10
+    evaluate_every_episodes: Size | None = None
+    evaluation_starts_episodes: Size = 100
     out: Path | None = None
     expert: Expert = "best"
     demos: Path | None = None
     env: str = "MountainCarContinuous-v0"
-    devices: int | None = None
-    group: int | None = None
+    devices: Size | None = None
+    group: Size | None = None
     distributed: bool = False
     coordinator: str | None = None
-    processes: int | None = None
-    process_id: int | None = None
-    checkpoint_every: float = 60.0
+    processes: Size | None = None
+    process_id: Count | None = None
+    checkpoint_every: NotNegative = 60.0
     experts: ExpertSettings = ExpertSettings()
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 
-from cmedirl_jax import envs, networks
+from cmedirl_jax import envs, networks, ranges
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
@@ -13,31 +13,8 @@ from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.tabular import imitation
-from cmedirl_jax.training import compose, ranges
+from cmedirl_jax.training import compose
 from cmedirl_jax.training.methods import METHODS, ExplorationSettings, Method
-from cmedirl_jax.training.ranges import COUNT, NOT_NEGATIVE, SIZE, Range
-
-RANGES: dict[str, Range] = {
-    "n_demos": SIZE,
-    "seeds": SIZE,
-    "seed": Range(0, 2**32 - 1, "between 0 and 2^32 - 1"),
-    "max_steps": SIZE,
-    "max_episodes": SIZE,
-    "evaluate_every": SIZE,
-    "evaluation_starts": SIZE,
-    "evaluate_every_episodes": SIZE,
-    "evaluation_starts_episodes": SIZE,
-    "devices": SIZE,
-    "group": SIZE,
-    "processes": SIZE,
-    "process_id": COUNT,
-    "checkpoint_every": NOT_NEGATIVE,
-    "experts.seeds": SIZE,
-    "experts.steps": SIZE,
-    "experts.trajectories": SIZE,
-    **{f"settings.{name}": of_name for name, of_name in ranges.RANGES.items()},
-}
-"""Of every number in `StudyConfig`."""
 
 
 class Cell(NamedTuple):
@@ -127,7 +104,7 @@ def _check_ranges(config: StudyConfig) -> None:
     Raises:
         UserError: naming the option, what it must be and what it is.
     """
-    for name, wrong in ranges.out_of_range(config, RANGES):
+    for name, wrong in ranges.out_of_range(config):
         option = name.removeprefix("settings.").replace("_", "-")
         raise UserError(f"--{option}: {wrong}")
 

@@ -25,6 +25,7 @@ from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.envs import Env
 from cmedirl_jax.irl import rewards
+from cmedirl_jax.ranges import AtLeastTwo, BelowOne, NotNegative, Positive, Size
 from cmedirl_jax.tabular import discretise, interpolation, maxent
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.tabular.interpolation import Grid
@@ -54,18 +55,18 @@ class TabularSettings:
         deep_learning_rate: Adam's rate for a deep reward.
     """
 
-    states: int = 41
-    actions: int = 7
-    subsamples: int = 1
-    discount: float = 0.99
-    temperature: float = 1.0
+    states: AtLeastTwo = 41
+    actions: AtLeastTwo = 7
+    subsamples: Size = 1
+    discount: BelowOne = 0.99
+    temperature: Positive = 1.0
     reward: rewards.Inputs = "state-action"
-    prior_precision: float = 1e-3
-    steps: int = 100
-    centres: int = 9
-    hidden: tuple[int, ...] = (64, 64)
-    linear_learning_rate: float = 0.3
-    deep_learning_rate: float = 1e-2
+    prior_precision: NotNegative = 1e-3
+    steps: Size = 100
+    centres: AtLeastTwo = 9
+    hidden: tuple[Size, ...] = (64, 64)
+    linear_learning_rate: NotNegative = 0.3
+    deep_learning_rate: NotNegative = 1e-2
 
 
 def discretised(

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import NamedTuple
 
-from cmedirl_jax import checks, irl, networks
+from cmedirl_jax import checks, irl, networks, ranges
 from cmedirl_jax.agents import ddpg, exploration
 from cmedirl_jax.agents.ddpg import DDPG
 from cmedirl_jax.agents.exploration import EpsilonGreedyHParams, Exploration
@@ -13,7 +13,6 @@ from cmedirl_jax.irl import RewardLearner, reward_batches, rewards
 from cmedirl_jax.irl.reward_batches import RewardSampler
 from cmedirl_jax.irl.shaping import Shaping
 from cmedirl_jax.tabular import imitation, table_reward
-from cmedirl_jax.training import ranges
 from cmedirl_jax.training.methods import (
     ExplorationSettings,
     Method,

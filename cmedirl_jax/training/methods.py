@@ -14,6 +14,7 @@ from cmedirl_jax.irl import GAILHParams, IRLHParams
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
 from cmedirl_jax.irl.shaping import Shaping
 from cmedirl_jax.networks import Architecture
+from cmedirl_jax.ranges import AtLeastTwo, Positive, Size
 from cmedirl_jax.tabular import imitation
 from cmedirl_jax.tabular.imitation import TabularSettings
 from cmedirl_jax.training.schedules import RewardSchedule, Schedule
@@ -103,7 +104,7 @@ class ExplorationSettings:
     """
 
     kind: Literal["ornstein-uhlenbeck", "gaussian", "epsilon-greedy"] = "ornstein-uhlenbeck"
-    hot_start_factor: float = 1.0
+    hot_start_factor: Positive = 1.0
     ornstein_uhlenbeck: OrnsteinUhlenbeckHParams = OrnsteinUhlenbeckHParams()
     gaussian: GaussianHParams = GaussianHParams()
     epsilon_greedy: EpsilonGreedyHParams = EpsilonGreedyHParams()
@@ -123,9 +124,9 @@ class RewardNetworkSettings:
 
     kind: Literal["deep", "radial-basis", "fourier"] = "deep"
     inputs: Literal["state-action", "state"] = "state-action"
-    hidden: tuple[int, ...] = (64, 64)
-    centres: int = 9
-    order: int = 3
+    hidden: tuple[Size, ...] = (64, 64)
+    centres: AtLeastTwo = 9
+    order: Size = 3
 
 
 @dataclasses.dataclass(frozen=True)

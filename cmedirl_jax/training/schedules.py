@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from cmedirl_jax import checks
 from cmedirl_jax.irl.shaping import Shaping
+from cmedirl_jax.ranges import Count, Size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,10 +31,10 @@ class RewardSchedule:
             Phi(s) with r_D(s) for Phi, or r_D alone; None: as the method says.
     """
 
-    period: int = 4
-    iterations: int = 1
-    stop: int | None = 2000
-    anneal_steps: int | None = None
+    period: Size = 4
+    iterations: Size = 1
+    stop: Count | None = 2000
+    anneal_steps: Size | None = None
     storage: Literal["recompute", "store"] = "recompute"
     shaping: Shaping | None = None
 
@@ -55,14 +56,14 @@ class Schedule:
         behaviour_cloning_steps: Environment steps over which "annealed" cloning falls.
     """
 
-    batch_size: int = 32
-    replay_capacity: int | None = None
-    learning_starts: int = 200
-    update_period: int = 1
-    target_period: int = 1
-    frozen_actor_steps: int = 0
+    batch_size: Size = 32
+    replay_capacity: Size | None = None
+    learning_starts: Count = 200
+    update_period: Size = 1
+    target_period: Size = 1
+    frozen_actor_steps: Count = 0
     cloning: Literal["none", "constant", "annealed"] = "annealed"
-    behaviour_cloning_steps: int = 4000
+    behaviour_cloning_steps: Size = 4000
 
 
 class Plan(NamedTuple):

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cmedirl_jax import ranges
 from cmedirl_jax.agents.ddpg import DDPGHParams
 from cmedirl_jax.networks import Architecture
-from cmedirl_jax.training import compose, ranges
+from cmedirl_jax.training import compose
 from cmedirl_jax.training.methods import METHODS, Settings
 
 
@@ -20,14 +21,20 @@ def test_the_defaults_are_in_range():
     ranges.check(Settings())
 
 
-@pytest.mark.parametrize(
-    "interval", dict.fromkeys(ranges.RANGES.values()), ids=lambda interval: interval.words
-)
-def test_a_range_holds_its_ends_and_nothing_beyond_or_undefined(interval):
-    one = dataclasses.make_dataclass("One", [("number", float)])
+NAMED = {
+    name: kind.__metadata__[0]
+    for name, kind in vars(ranges).items()
+    if isinstance(getattr(kind, "__metadata__", (None,))[0], ranges.Range)
+}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_a_range_holds_its_ends_and_nothing_beyond_or_undefined(name):
+    interval = NAMED[name]
+    one = dataclasses.make_dataclass("One", [("number", getattr(ranges, name))])
 
     def wrong(value):
-        return list(ranges.out_of_range(one(value), {"number": interval}))
+        return list(ranges.out_of_range(one(value)))
 
     assert not wrong(interval.low)
     assert not wrong(interval.high)
@@ -39,11 +46,29 @@ def test_a_range_holds_its_ends_and_nothing_beyond_or_undefined(interval):
     assert wrong(math.nan) == [("number", f"must be {interval.words}, got nan")]
 
 
+def test_a_range_is_found_in_optional_fields_and_in_tuples():
+    nested = dataclasses.make_dataclass("Nested", [("sizes", tuple[ranges.Size, ...])])
+    whole = dataclasses.make_dataclass(
+        "Whole", [("limit", ranges.Count | None), ("nested", nested), ("name", str)]
+    )
+    assert not list(ranges.out_of_range(whole(None, nested(()), "any")))
+    assert list(ranges.out_of_range(whole(-1, nested((1, 0)), "any"))) == [
+        ("limit", "must be at least 0, got -1"),
+        ("nested.sizes", "must be at least 1, got 0"),
+    ]
+
+
+def test_a_number_without_a_range_is_an_error_of_ours():
+    forgotten = dataclasses.make_dataclass("Forgotten", [("number", float)])
+    with pytest.raises(TypeError, match="number has no range"):
+        ranges.check(forgotten(1.0))
+
+
 def test_what_32_bits_cannot_hold_is_out_of_range():
-    ((_, wrong),) = ranges.out_of_range(with_tau(1e-50), ranges.RANGES)
+    ((_, wrong),) = ranges.out_of_range(with_tau(1e-50))
     assert wrong == "must be above 0 and at most 1, got 1e-50"
     settings = dataclasses.replace(Settings(), architecture=Architecture(hidden=(64, 2**31)))
-    ((_, wrong),) = ranges.out_of_range(settings, ranges.RANGES)
+    ((_, wrong),) = ranges.out_of_range(settings)
     assert wrong == "must be at most 2^31 - 1, got 2147483648"
 
 

@@ -1,0 +1,110 @@
+"""The range of a number, written beside the field that holds it.
+
+A settings class annotates a field with one of the types below, or with `Annotated` and a `Range`:
+
+    class Schedule:
+        batch_size: Size = 32
+        seed: Annotated[int, Range(0, 2**32 - 1, "between 0 and 2^32 - 1")] = 0
+
+`check` reads these annotations.
+"""
+
+import dataclasses
+import functools
+import typing
+from collections.abc import Iterator
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+
+_FLOAT = np.finfo(np.float32)
+
+
+class Range(NamedTuple):
+    """A closed interval. NaN lies outside.
+
+    Attributes:
+        low: the least value.
+        high: the largest value.
+        words: what a value must be, after "must be".
+        too_large: what a value above `high` must be, if that says it better than `words`.
+    """
+
+    low: float
+    high: float
+    words: str
+    too_large: str | None = None
+
+
+# The library counts in 32 bits and computes in 32-bit floats, whose infinity begins at 3.4e38.
+_LARGEST = 2**31 - 1
+_COUNT = Range(0, _LARGEST, "at least 0", "at most 2^31 - 1")
+POSITIVE = Range(float(_FLOAT.tiny), float(_FLOAT.max), "positive and finite")
+
+Count = Annotated[int, _COUNT]
+Size = Annotated[int, _COUNT._replace(low=1, words="at least 1")]
+AtLeastTwo = Annotated[int, _COUNT._replace(low=2, words="at least 2")]
+NotNegative = Annotated[float, Range(0.0, float(_FLOAT.max), "at least 0 and finite")]
+Positive = Annotated[float, POSITIVE]
+AtLeastOne = Annotated[float, Range(1.0, float(_FLOAT.max), "at least 1 and finite")]
+Share = Annotated[float, Range(0.0, 1.0, "between 0 and 1")]
+PositiveShare = Annotated[float, Range(float(_FLOAT.tiny), 1.0, "above 0 and at most 1")]
+BelowOne = Annotated[float, Range(0.0, 1.0 - float(_FLOAT.epsneg), "at least 0 and below 1")]
+
+
+def check(settings: Any) -> None:
+    """Refuse numbers out of their range. Traced numbers and arrays pass: their values are unknown.
+
+    Args:
+        settings: a dataclass, of which every number and every nested dataclass is checked.
+
+    Raises:
+        ValueError: naming the first such number, what it must be and what it is.
+        TypeError: for a number whose field has no range.
+    """
+    for name, wrong in out_of_range(settings):
+        raise ValueError(f"{name} {wrong}")
+
+
+def out_of_range(settings: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """The dotted name of each number of a dataclass that is out of its range, and what is wrong.
+
+    Raises:
+        TypeError: for a number whose field has no range.
+    """
+    for field, interval in of_fields(type(settings)).items():
+        name, value = prefix + field, getattr(settings, field)
+        if dataclasses.is_dataclass(value):
+            yield from out_of_range(value, f"{name}.")
+            continue
+        # Of a tuple, each of its numbers.
+        for number in value if isinstance(value, tuple) else (value,):
+            if not isinstance(number, int | float | np.number) or isinstance(number, bool):
+                continue
+            if interval is None:
+                raise TypeError(f"{name} has no range: annotate its field with one")
+            if not interval.low <= number <= interval.high:
+                yield name, f"must be {_words(interval, number)}, got {number}"
+
+
+def _words(interval: Range, number: Any) -> str:
+    if interval.too_large is not None and number > interval.high:
+        return interval.too_large
+    return interval.words
+
+
+@functools.cache
+def of_fields(settings: type) -> dict[str, Range | None]:
+    """The range of each field of a dataclass; None where its annotation has none."""
+    hints = typing.get_type_hints(settings, include_extras=True)
+    return {
+        field.name: next(_found(hints[field.name]), None) for field in dataclasses.fields(settings)
+    }
+
+
+def _found(annotation: Any) -> Iterator[Range]:
+    for extra in getattr(annotation, "__metadata__", ()):
+        if isinstance(extra, Range):
+            yield extra
+    for part in typing.get_args(annotation):
+        yield from _found(part)
