@@ -65,7 +65,7 @@ def test_any_leaf_of_another_dtype_is_refused_by_name(skewed_spec, field):
 def test_a_specification_that_contradicts_itself_is_refused(skewed_spec, change, named):
     checks.env_spec(skewed_spec)
     wrong = skewed_spec._replace(**change)
-    for refuse in (checks.env_spec, ddpg.make, irl.make, irl.adversarial.make):
+    for refuse in (checks.env_spec, ddpg.make, irl.make, irl.gail.make):
         with pytest.raises(ValueError, match=rf"^Skewed-v0: .*{named}"):
             refuse(wrong)
     with pytest.raises(ValueError, match=named):
@@ -90,7 +90,7 @@ def public_functions(spec):
     learners = {
         "irl": irl.make(spec),
         "trajectories": irl.make(spec, irl.IRLHParams(objective="trajectory")),
-        "gail": irl.adversarial.make(spec),
+        "gail": irl.gail.make(spec),
         "random": irl.controls.random(spec),
     }
     key = jax.random.key(0)

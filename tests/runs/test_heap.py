@@ -10,7 +10,7 @@ from cmedirl_jax.runs import heap
 # Eight threads that allocate at the same time, each from the arena that it was given.
 SCRIPT = """
 import ctypes, re, sys, tempfile, threading
-from experiments import heap
+from cmedirl_jax.runs import heap
 
 if sys.argv[1:]:
     heap.share(arenas=int(sys.argv[1]))

@@ -145,7 +145,7 @@ def make_pool(env, monkeypatch):
                 final=STRENGTHS,
             )
 
-        monkeypatch.setattr(experts.cells, "train", train)
+        monkeypatch.setattr(experts.cell_lib, "train", train)
         return experts.make_pool(
             jax.random.key(0),
             env,

@@ -39,9 +39,9 @@ def test_what_cannot_be_printed_is_done_without(monkeypatch, dead):
 @pytest.mark.parametrize("dead", DEAD)
 def test_python_ends_in_peace_when_nobody_reads(dead):
     script = (
-        "import sys; from experiments import output\n"
-        "print('out'); output.complain('error'); print('warning', file=sys.stderr, end='')\n"
-        "output.flush(); sys.exit(3)"
+        "import sys; from cmedirl_jax.runs.console import streams\n"
+        "print('out'); streams.complain('error'); print('warning', file=sys.stderr, end='')\n"
+        "streams.flush(); sys.exit(3)"
     )
     descriptor = DEAD[dead]()
     done = subprocess.run(
