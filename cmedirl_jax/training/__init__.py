@@ -2,6 +2,7 @@
 
 from cmedirl_jax.training.fit import Result, fit
 from cmedirl_jax.training.initialise import TrainingState
-from cmedirl_jax.training.step import Log, Trainer, make
+from cmedirl_jax.training.step import Behaviour, Log
+from cmedirl_jax.training.trainer import Trainer, make
 
-__all__ = ["Log", "Result", "Trainer", "TrainingState", "fit", "make"]
+__all__ = ["Behaviour", "Log", "Result", "Trainer", "TrainingState", "fit", "make"]

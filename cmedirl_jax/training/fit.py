@@ -14,7 +14,8 @@ from cmedirl_jax.training import seeds as seeds_lib
 from cmedirl_jax.training.evaluation import Evaluation
 from cmedirl_jax.training.initialise import TrainingState
 from cmedirl_jax.training.methods import Method, Settings
-from cmedirl_jax.training.step import Log, make
+from cmedirl_jax.training.step import Log
+from cmedirl_jax.training.trainer import make
 
 
 class Result(NamedTuple):

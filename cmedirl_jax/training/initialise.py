@@ -1,5 +1,6 @@
 """How a seed begins: its demonstrations, its networks and their hot start, its reward."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -37,6 +38,8 @@ class TrainingState(flax.struct.PyTreeNode):
         episode_return: `[]`, of the running episode.
         episode_length: `[]` int32, of the running episode.
         subset: the seed's own demonstrations, or None.
+        observation_statistics: running statistics that normalise observations; None where they
+            are normalised by their bounds.
     """
 
     key: jax.Array
@@ -51,6 +54,7 @@ class TrainingState(flax.struct.PyTreeNode):
     episode_return: jax.Array
     episode_length: jax.Array
     subset: DemonstrationSubset | None
+    observation_statistics: Any = None
 
 
 class Initialisation(NamedTuple):
@@ -78,69 +82,120 @@ def make(
     env_params: Any,
     subset_size: int | None,
 ) -> Initialisation:
-    """Make the initialisation of a method's seeds; see `step.make`."""
-    agent, learner, sampler = algorithm.agent, algorithm.learner, algorithm.sampler
+    """Make the initialisation of a method's seeds; see `trainer.make`."""
+    parts = _Parts(env, env_params, method, settings, algorithm, subset_size)
+    return Initialisation(functools.partial(_draw_networks, parts), functools.partial(_init, parts))
 
-    def split(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        # Apart from the steps' keys: folding i into a key gives the i-th key of its split.
-        setup_key, steps_key = jax.random.split(key)
-        return jax.random.split(setup_key, 7), steps_key
 
-    def draw_networks(key: jax.Array) -> tuple[Params, Params]:
-        (agent_key, *_), _ = split(key)
-        state = agent.init(agent_key)
-        return state.actor, state.critic
+class _Parts(NamedTuple):
+    """What the functions below are bound to."""
 
-    def fit_tabular(
-        key: jax.Array, data: HotStartData, subset: DemonstrationSubset, kind: imitation.Kind
-    ) -> RewardState:
-        mdp = imitation.discretised(env, settings.tabular, params=env_params)
-        found = imitation.fit(
-            key, mdp, env.spec, data, subset, kind=kind, settings=settings.tabular
+    env: Env
+    env_params: Any
+    method: Method
+    settings: Settings
+    algorithm: Algorithm
+    subset_size: int | None
+
+
+class _Keys(NamedTuple):
+    """Independent keys for all that is drawn once per seed."""
+
+    agent: jax.Array
+    hot_start: jax.Array
+    reward: jax.Array
+    env: jax.Array
+    noise: jax.Array
+    subset: jax.Array
+    sampler: jax.Array
+
+
+def _split(key: jax.Array) -> tuple[_Keys, jax.Array]:
+    """The keys of the beginning, and the key that every step's number is folded into."""
+    # `fold_in(key, i)` equals the i-th key of a split of `key`: the steps need a key of their own.
+    setup_key, steps_key = jax.random.split(key)
+    return _Keys(*jax.random.split(setup_key, len(_Keys._fields))), steps_key
+
+
+def _draw_networks(parts: _Parts, key: jax.Array) -> tuple[Params, Params]:
+    state = parts.algorithm.agent.init(_split(key)[0].agent)
+    return state.actor, state.critic
+
+
+def _init(
+    parts: _Parts,
+    key: jax.Array,
+    data: HotStartData | None,
+    n_demonstrations: Numeric,
+    networks: tuple[Params, Params] | None = None,
+) -> TrainingState:
+    algorithm = parts.algorithm
+    keys, steps_key = _split(key)
+    if networks is None:
+        networks = _draw_networks(parts, key)
+    reward = algorithm.learner.init(keys.reward) if algorithm.learner else None
+    subset, sampler_state = None, None
+
+    # What the demonstrations give: the hot start, a tabular reward, the sampler's fitted Gaussian.
+    if parts.method.uses_demonstrations:
+        if data is None:
+            raise ValueError(f"{parts.method.name} needs demonstrations")
+        subset = demonstrations_lib.subset(
+            keys.subset, data.episodes, n_demonstrations, parts.subset_size
         )
-        return table_reward.state(found.reward[:-1], settings.reward)
-
-    def init(
-        key: jax.Array,
-        data: HotStartData | None,
-        n_demonstrations: Numeric,
-        networks: tuple[Params, Params] | None = None,
-    ) -> TrainingState:
-        keys, steps_key = split(key)
-        agent_key, fit_key, reward_key, env_key, noise_key, subset_key, sampler_key = keys
-        if networks is None:
-            networks = draw_networks(key)
-        subset = None
-        reward = learner.init(reward_key) if learner else None
-        sampler_state = None
-        if method.uses_demonstrations:
-            if data is None:
-                raise ValueError(f"{method.name} needs demonstrations")
-            subset = demonstrations_lib.subset(
-                subset_key, data.episodes, n_demonstrations, subset_size
+        networks, reward = _learn_beforehand(parts, keys, data, subset, networks, reward)
+        if algorithm.sampler is not None:
+            sampler_state = algorithm.sampler.init(
+                keys.sampler, networks[0], data.transition, subset
             )
-            if method.hot_start:
-                networks = hot_start.fit(
-                    fit_key, agent.networks, networks, data, settings.hot_start, subset=subset
-                )
-            if method.tabular is not None:
-                reward = fit_tabular(reward_key, data, subset, method.tabular)
-            if sampler is not None:
-                sampler_state = sampler.init(sampler_key, networks[0], data.transition, subset)
-        env_state, observation = env.reset(env_key, env_params)
-        return TrainingState(
-            key=steps_key,
-            agent=agent.init(agent_key, networks),
-            reward=reward,
-            storage=algorithm.replay.init().storage,
-            sampler=sampler_state,
-            exploration=algorithm.exploration.init(noise_key),
-            env=env_state,
-            observation=observation,
-            episode=jnp.zeros((), jnp.int32),
-            episode_return=jnp.zeros(()),
-            episode_length=jnp.zeros((), jnp.int32),
+
+    # The first episode.
+    env_state, observation = parts.env.reset(keys.env, parts.env_params)
+    return TrainingState(
+        key=steps_key,
+        agent=algorithm.agent.init(keys.agent, networks),
+        reward=reward,
+        storage=algorithm.replay.init().storage,
+        sampler=sampler_state,
+        exploration=algorithm.exploration.init(keys.noise),
+        env=env_state,
+        observation=observation,
+        episode=jnp.zeros((), jnp.int32),
+        episode_return=jnp.zeros(()),
+        episode_length=jnp.zeros((), jnp.int32),
+        subset=subset,
+    )
+
+
+def _learn_beforehand(
+    parts: _Parts,
+    keys: _Keys,
+    data: HotStartData,
+    subset: DemonstrationSubset,
+    networks: tuple[Params, Params],
+    reward: RewardState | None,
+) -> tuple[tuple[Params, Params], RewardState | None]:
+    """Hot-start the networks, and fit a tabular reward, where the method does so."""
+    method, settings = parts.method, parts.settings
+    if method.hot_start:
+        networks = hot_start.fit(
+            keys.hot_start,
+            parts.algorithm.agent.networks,
+            networks,
+            data,
+            settings.hot_start,
             subset=subset,
         )
-
-    return Initialisation(draw_networks, init)
+    if method.tabular is not None:
+        mdp = imitation.discretised(parts.env, settings.tabular, params=parts.env_params)
+        fitted = imitation.fit(
+            keys.reward,
+            mdp,
+            parts.env.spec,
+            data,
+            subset,
+            kind=method.tabular,
+            settings=settings.tabular,
+        )
+        reward = table_reward.state(fitted.reward[:-1], settings.reward)
+    return networks, reward

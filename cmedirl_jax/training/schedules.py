@@ -10,9 +10,11 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, ranges
 from cmedirl_jax.irl.shaping import Shaping
 from cmedirl_jax.ranges import Count, Size
+
+Cloning = Literal["none", "constant", "annealed"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Schedule:
     update_period: Size = 1
     target_period: Size = 1
     frozen_actor_steps: Count = 0
-    cloning: Literal["none", "constant", "annealed"] = "annealed"
+    cloning: Cloning = "annealed"
     behaviour_cloning_steps: Size = 4000
 
 
@@ -92,24 +94,19 @@ def plan(step: jax.Array, schedule: Schedule, reward_schedule: RewardSchedule) -
     """What environment step `step` (`[]` int32) does.
 
     Raises:
-        ValueError: if `step` is no scalar, or a period or the length of a fall not positive.
-        TypeError: if one of them is not an integer.
+        ValueError: if `step` is not a scalar, or a number of the schedules is out of its range.
+        TypeError: if `step` is not an integer.
     """
     checks.shape("step", step, ())
     checks.kind("step", step, jnp.integer)
-    checks.sizes(
-        period=reward_schedule.period,
-        update_period=schedule.update_period,
-        target_period=schedule.target_period,
-        behaviour_cloning_steps=schedule.behaviour_cloning_steps,
-    )
+    ranges.check(schedule)
+    ranges.check(reward_schedule)
     learns = step >= schedule.learning_starts
     learn_reward = learns & (step % reward_schedule.period == 0)
     if reward_schedule.stop is not None:
         learn_reward &= step < reward_schedule.stop
     reward_weight = jnp.ones_like(step, jnp.float32)
     if reward_schedule.anneal_steps is not None:
-        checks.sizes(anneal_steps=reward_schedule.anneal_steps)
         reward_weight = _falling(step, reward_schedule.anneal_steps)
     return Plan(
         step=step,

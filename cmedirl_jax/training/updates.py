@@ -1,7 +1,10 @@
-"""What a step learns from the replay and the demonstrations: the inner lines of Algorithm 2."""
+"""What a step learns from the replay and the demonstrations: the inner lines of Algorithm 2.
+
+Every function takes the method's `UpdateParts` first; `step` binds them.
+"""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,18 +17,64 @@ from cmedirl_jax.irl import RewardInfo, RewardState, base, regularisers, shaping
 from cmedirl_jax.irl.reward_batches import SampleDraws
 from cmedirl_jax.training.compose import Algorithm
 from cmedirl_jax.training.methods import Method, Settings
-from cmedirl_jax.training.schedules import Plan
-from cmedirl_jax.types import Numeric, Transition
+from cmedirl_jax.training.schedules import Cloning, Plan
+from cmedirl_jax.types import Numeric, RewardBatch, Transition
 
 
-class Draws(NamedTuple):
+class UpdateParts(NamedTuple):
+    """What a method's updates are made of. All static.
+
+    Attributes:
+        algorithm: the method's parts.
+        batch_size: transitions per update of the agent.
+        iterations: K of Algorithm 1, iterations per update of the reward.
+        cloning: how the behaviour-cloning term goes on after the hot start.
+        stores_shaped: r* is stored in the replay in place of r_e.
+        freezes_actor: a hot-started actor waits while the critic learns.
+        always_moves_targets: the targets move at every update of the agent.
+        draws_penalty: the reward's update draws random numbers of its own.
+    """
+
+    algorithm: Algorithm
+    batch_size: int
+    iterations: int
+    cloning: Cloning
+    stores_shaped: bool
+    freezes_actor: bool
+    always_moves_targets: bool
+    draws_penalty: bool
+
+    @property
+    def reward_samples(self) -> int:
+        """Samples of each kind that the K iterations of a reward's update read in all."""
+        sampler = self.algorithm.sampler
+        return 0 if sampler is None else self.iterations * sampler.batch_size
+
+
+def make_parts(algorithm: Algorithm, method: Method, settings: Settings) -> UpdateParts:
+    """Read off the settings what is static, so that no branch is compiled for it."""
+    schedule, reward_schedule = settings.schedule, settings.reward_schedule
+    return UpdateParts(
+        algorithm=algorithm,
+        batch_size=schedule.batch_size,
+        iterations=reward_schedule.iterations,
+        cloning=schedule.cloning if method.hot_start else "none",
+        stores_shaped=algorithm.learner is not None and reward_schedule.storage == "store",
+        freezes_actor=method.hot_start and schedule.frozen_actor_steps > 0,
+        always_moves_targets=schedule.target_period <= schedule.update_period,
+        draws_penalty=method.reward == "maxent" and settings.reward.gradient_penalty is not None,
+    )
+
+
+class UpdateDraws(NamedTuple):
     """The randomness of a step's minibatches; what a method does not use is empty.
 
     Attributes:
-        batch: of the agent's, from the replay.
-        reward: of the reward's, K iterations one after the other.
+        batch: of the agent's minibatch, from the replay.
+        reward: of the reward's samples, K iterations one after the other.
         penalty: key of the reward's other randomness, or None.
-        cloning: rows of the pool for behaviour cloning; of pairs, the reward reads the same ones.
+        cloning: rows of the pool for behaviour cloning. Where the reward learns from pairs, it
+            reads the same rows.
     """
 
     batch: jax.Array
@@ -34,120 +83,126 @@ class Draws(NamedTuple):
     cloning: jax.Array
 
 
-class Updates(NamedTuple):
-    """The updates of one step, as pure functions of one seed.
-
-    Attributes:
-        draw: `(key, subset) -> Draws`.
-        stores_shaped: r* is stored in the replay in place of r_e (static).
-        shape: `(reward_state, batch, discount, weight) -> Transition` with r* in place of r_e (Eq.
-            10).
-        update_reward: `(reward_state, samples, draws) -> (RewardState, RewardInfo)`, K iterations
-            of Algorithm 1 and the last one's diagnostics; `samples` takes `SampleDraws`.
-        update_agent: `(agent_state, reward_state, pool, replay_state, draws, plan) -> (DDPGState,
-            DDPGInfo)`, one update on r*.
-    """
-
-    draw: Callable[[jax.Array, DemonstrationSubset | None], Draws]
-    stores_shaped: bool
-    shape: Callable[..., Transition]
-    update_reward: Callable[..., tuple[RewardState, RewardInfo]]
-    update_agent: Callable[..., tuple[DDPGState, DDPGInfo]]
-
-
-def make(algorithm: Algorithm, method: Method, settings: Settings) -> Updates:
-    """Make the updates of a method from its parts."""
-    agent, learner, replay = algorithm.agent, algorithm.learner, algorithm.replay
-    sampler = algorithm.sampler
-    schedule = settings.reward_schedule
-    cloning = settings.schedule.cloning
-    clones = method.hot_start and cloning != "none"
-    stores_shaped = learner is not None and schedule.storage == "store"
-    maxent = method.reward == "maxent"
-    penalised = maxent and settings.reward.gradient_penalty is not None
-    per_iteration = 0 if sampler is None else sampler.batch_size
-    sampled = schedule.iterations * per_iteration
+def draw(parts: UpdateParts, key: jax.Array, subset: DemonstrationSubset | None) -> UpdateDraws:
+    """Draw a step's minibatches from the seed's subset of the demonstrations."""
+    replay, sampler = parts.algorithm.replay, parts.algorithm.sampler
+    batch_key, background_key, demonstrations_key = jax.random.split(key, 3)
+    # Rows of the pool, shared by behaviour cloning and a reward that learns from pairs.
+    cloned = 0 if parts.cloning == "none" else parts.batch_size
+    sampled = parts.reward_samples
     shared = sampled if sampler is not None and sampler.shares_pairs else 0
-    agent_batch = settings.schedule.batch_size
-    # Constants, so that no branch is compiled: branches copy what passes through them.
-    always_moves_targets = settings.schedule.target_period <= settings.schedule.update_period
-    freezes_actor = method.hot_start and settings.schedule.frozen_actor_steps > 0
+    rows = jnp.zeros((0,), jnp.int32)
+    if max(cloned, shared) and subset is not None:
+        rows = demonstrations.sample_index(demonstrations_key, subset, max(cloned, shared))
+    chosen = rows[:0]
+    if sampler is not None and subset is not None:
+        chosen = sampler.choose(jax.random.fold_in(key, 4), subset, rows, sampled)
+    return UpdateDraws(
+        batch=replay.draw(batch_key, parts.batch_size),
+        reward=SampleDraws(replay.draw(background_key, sampled), chosen),
+        penalty=jax.random.fold_in(key, 3) if parts.draws_penalty else None,
+        cloning=rows[:cloned],
+    )
 
-    def draw(key: jax.Array, subset: DemonstrationSubset | None) -> Draws:
-        batch_key, background_key, demonstrations_key = jax.random.split(key, 3)
-        rows = jnp.zeros((0,), jnp.int32)
-        pairs = max(agent_batch if clones else 0, shared)
-        if pairs and subset is not None:
-            rows = demonstrations.sample_index(demonstrations_key, subset, pairs)
-        chosen = rows[:sampled]
-        if sampler is not None and subset is not None:
-            chosen = sampler.choose(jax.random.fold_in(key, 4), subset, rows, sampled)
-        return Draws(
-            batch=replay.draw(batch_key, agent_batch),
-            reward=SampleDraws(replay.draw(background_key, sampled), chosen),
-            penalty=jax.random.fold_in(key, 3) if penalised else None,
-            cloning=rows[:agent_batch] if clones else rows[:0],
+
+def shape(
+    parts: UpdateParts,
+    reward_state: RewardState | None,
+    batch: Transition,
+    discount: Numeric,
+    weight: Numeric,
+) -> Transition:
+    """Put r* in place of r_e (Eq. 10).
+
+    Args:
+        parts: the method's.
+        reward_state: the state of r_D; None for a method without.
+        batch: transitions `[..., ...]` with the environment's reward r_e.
+        discount: the agent's.
+        weight: of r_D beside r_e.
+    """
+    learner, how = parts.algorithm.learner, parts.algorithm.shaping
+    if learner is None or reward_state is None:
+        return batch
+    r_d = learner.reward(reward_state, batch.observation, batch.action)
+    if how == "potential":
+        after = learner.reward(reward_state, batch.next_observation, batch.action)
+        reward = shaping.potential(batch.reward, r_d, after, batch.terminated, discount, weight)
+        return batch._replace(reward=reward)
+    if learner.absorbing is not None:
+        r_d += regularisers.absorbed_reward(
+            learner.absorbing(reward_state), batch.terminated, discount
         )
+    r_e = batch.reward if how == "additive" else jnp.zeros_like(batch.reward)
+    return batch._replace(reward=shaping.additive(r_e, r_d, weight))
 
-    def shape(
-        reward_state: RewardState | None, batch: Transition, discount: Numeric, weight: Numeric
-    ) -> Transition:
-        if learner is None or reward_state is None:
-            return batch
-        r_d = learner.reward(reward_state, batch.observation, batch.action)
-        if algorithm.shaping == "potential":
-            after = learner.reward(reward_state, batch.next_observation, batch.action)
-            reward = shaping.potential(batch.reward, r_d, after, batch.terminated, discount, weight)
-            return batch._replace(reward=reward)
-        if learner.absorbing is not None:
-            r_d += regularisers.absorbed_reward(
-                learner.absorbing(reward_state), batch.terminated, discount
-            )
-        r_e = batch.reward if algorithm.shaping == "additive" else jnp.zeros_like(batch.reward)
-        return batch._replace(reward=shaping.additive(r_e, r_d, weight))
 
-    def update_reward(
-        reward_state: RewardState,
-        samples: Callable[[SampleDraws], tuple[Any, Any]],
-        draws: Draws,
-    ) -> tuple[RewardState, RewardInfo]:
-        assert learner is not None
-        info = base.no_info()
-        for k in range(schedule.iterations):
-            rows = slice(k * per_iteration, (k + 1) * per_iteration)
-            key = None if draws.penalty is None else jax.random.fold_in(draws.penalty, k)
-            batches = samples(jax.tree.map(lambda leaf, rows=rows: leaf[rows], draws.reward))
-            reward_state, info = learner.update(reward_state, *batches, key=key)
-        return reward_state, info
+def update_reward(
+    parts: UpdateParts,
+    reward_state: RewardState,
+    take: Callable[[SampleDraws], tuple[RewardBatch, RewardBatch]],
+    draws: UpdateDraws,
+) -> tuple[RewardState, RewardInfo]:
+    """K iterations of Algorithm 1; the diagnostics are the last one's.
 
-    def update_agent(
-        agent_state: DDPGState,
-        reward_state: RewardState | None,
-        pool: Transition | None,
-        replay_state: ReplayState,
-        draws: Draws,
-        plan: Plan,
-    ) -> tuple[DDPGState, DDPGInfo]:
-        batch = replay.take(replay_state, draws.batch)
-        if not stores_shaped:
-            discount = agent_state.hparams.discount
-            batch = shape(reward_state, batch, discount, plan.reward_weight)
-        update_actor = plan.update_actor if freezes_actor else True
-        update_targets = True if always_moves_targets else plan.update_targets
-        if not clones:
-            return agent.update(
-                agent_state, batch, update_actor=update_actor, update_targets=update_targets
-            )
-        hparams = agent_state.hparams
-        faded = hparams.replace(behaviour_cloning=hparams.behaviour_cloning * plan.cloning_weight)
-        agent_state, info = agent.update(
-            agent_state.replace(hparams=faded),
-            batch,
-            demonstrations.at(pool, draws.cloning),  # type: ignore[arg-type]
-            update_actor=update_actor,
-            update_targets=update_targets,
-            clone=True if cloning == "constant" else plan.cloning_weight > 0,
+    Args:
+        parts: of a method that learns its reward.
+        reward_state: the state before.
+        take: turns an iteration's draws into its demonstrations and background.
+        draws: the step's.
+    """
+    learner, sampler = parts.algorithm.learner, parts.algorithm.sampler
+    assert learner is not None
+    assert sampler is not None
+    info = base.no_info()
+    for k in range(parts.iterations):
+        rows = slice(k * sampler.batch_size, (k + 1) * sampler.batch_size)
+        key = None if draws.penalty is None else jax.random.fold_in(draws.penalty, k)
+        batches = take(jax.tree.map(lambda leaf, rows=rows: leaf[rows], draws.reward))
+        reward_state, info = learner.update(reward_state, *batches, key=key)
+    return reward_state, info
+
+
+def update_agent(
+    parts: UpdateParts,
+    agent_state: DDPGState,
+    reward_state: RewardState | None,
+    pool: Transition | None,
+    replay_state: ReplayState,
+    draws: UpdateDraws,
+    plan: Plan,
+) -> tuple[DDPGState, DDPGInfo]:
+    """One update of actor and critic on r*.
+
+    Args:
+        parts: the method's.
+        agent_state: the state before.
+        reward_state: the state of r_D; None for a method without.
+        pool: the demonstrations' transitions `[N, ...]`; None for a method without.
+        replay_state: where the minibatch comes from.
+        draws: the step's.
+        plan: what the step does.
+    """
+    agent, hparams = parts.algorithm.agent, agent_state.hparams
+    # The minibatch, with r* in place of r_e.
+    batch = parts.algorithm.replay.take(replay_state, draws.batch)
+    if not parts.stores_shaped:
+        batch = shape(parts, reward_state, batch, hparams.discount, plan.reward_weight)
+    update_actor = plan.update_actor if parts.freezes_actor else True
+    update_targets = True if parts.always_moves_targets else plan.update_targets
+    if parts.cloning == "none":
+        return agent.update(
+            agent_state, batch, update_actor=update_actor, update_targets=update_targets
         )
-        return agent_state.replace(hparams=hparams), info
-
-    return Updates(draw, stores_shaped, shape, update_reward, update_agent)
+    # The cloning term fades by its weight; the state keeps the weight that it began with.
+    assert pool is not None
+    faded = hparams.replace(behaviour_cloning=hparams.behaviour_cloning * plan.cloning_weight)
+    agent_state, info = agent.update(
+        agent_state.replace(hparams=faded),
+        batch,
+        demonstrations.at(pool, draws.cloning),
+        update_actor=update_actor,
+        update_targets=update_targets,
+        clone=True if parts.cloning == "constant" else plan.cloning_weight > 0,
+    )
+    return agent_state.replace(hparams=hparams), info
