@@ -10,8 +10,9 @@ noise's state, and `Exploration.log_density`, of the state's greedy action alone
 of any policy about any action and is what mixtures of policies are made of.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import flax.struct
 import jax
@@ -22,7 +23,11 @@ from cmedirl_jax import checks
 from cmedirl_jax.agents import densities
 from cmedirl_jax.optimizers import traced
 from cmedirl_jax.ranges import AtLeastOne, NotNegative, Positive, Range, Share
+from cmedirl_jax.registries import Registry
 from cmedirl_jax.types import EnvSpec, Numeric
+
+ExplorationName = Literal["ornstein-uhlenbeck", "gaussian", "epsilon-greedy"]
+"""The names in `EXPLORATIONS`."""
 
 
 class PerturbFn(Protocol):
@@ -303,3 +308,164 @@ def _exploration(
         return checked_perturb(state, action, draw(key), step)
 
     return Exploration(init, reset, sample, draw, checked_perturb, checked_log_density)
+
+
+@dataclasses.dataclass(frozen=True)
+class ExplorationSettings:
+    """The behaviour policy.
+
+    Attributes:
+        kind: Which noise; the options of the others are ignored.
+        hot_start_factor: Factor on the noise of a hot-started method: on sigma, on the scale, or on
+            both epsilons.
+    """
+
+    kind: ExplorationName = "ornstein-uhlenbeck"
+    hot_start_factor: Positive = 1.0
+    ornstein_uhlenbeck: OrnsteinUhlenbeckHParams = OrnsteinUhlenbeckHParams()
+    gaussian: GaussianHParams = GaussianHParams()
+    epsilon_greedy: EpsilonGreedyHParams = EpsilonGreedyHParams()
+
+
+class CheckDensityFn(Protocol):
+    """Refuse importance weights for which the behaviour policy has no density."""
+
+    def __call__(self, hparams: Any, *, trajectories: bool, mixture: bool) -> None:
+        """Check the hyperparameters, where r_D is learned with 1 / density as weights.
+
+        Args:
+            hparams: the exploration's own.
+            trajectories: whole trajectories are weighed, not single pairs.
+            mixture: the density is that of a mixture of policies, not the one recorded.
+
+        Raises:
+            ValueError: naming the option that should be another.
+        """
+        ...
+
+
+class ExplorationKind(NamedTuple):
+    """All that belongs to the name of an exploration.
+
+    Attributes:
+        make: `(spec, hparams) -> Exploration`.
+        hparams: `(settings) -> hparams`, its own of the settings'.
+        scale: `(hparams, factor) -> hparams` with `factor` times the noise.
+        check_density: see `CheckDensityFn`.
+    """
+
+    make: Callable[[EnvSpec, Any], Exploration]
+    hparams: Callable[[ExplorationSettings], Any]
+    scale: Callable[[Any, Numeric], Any]
+    check_density: CheckDensityFn
+
+
+def make(
+    spec: EnvSpec, settings: ExplorationSettings | None = None, *, hot_start: bool = False
+) -> Exploration:
+    """The behaviour policy that `settings.kind` names.
+
+    Args:
+        spec: the environment's sizes and bounds.
+        settings: the kind, and its hyperparameters.
+        hot_start: whether the actor is hot-started: then the noise is that of the settings times
+            `hot_start_factor`.
+
+    Raises:
+        ValueError: for an unknown kind.
+    """
+    settings = settings or ExplorationSettings()
+    kind = EXPLORATIONS[settings.kind]
+    factor = settings.hot_start_factor if hot_start else 1.0
+    return kind.make(spec, kind.scale(kind.hparams(settings), factor))
+
+
+def check_density(settings: ExplorationSettings, *, trajectories: bool, mixture: bool) -> None:
+    """Refuse weights for which the behaviour policy has no density, see `CheckDensityFn`."""
+    kind = EXPLORATIONS[settings.kind]
+    kind.check_density(kind.hparams(settings), trajectories=trajectories, mixture=mixture)
+
+
+def _scale_gaussian(hparams: GaussianHParams, factor: Numeric) -> GaussianHParams:
+    return hparams.replace(scale=factor * hparams.scale)
+
+
+def _check_gaussian(hparams: GaussianHParams, *, trajectories: bool, mixture: bool) -> None:
+    del trajectories, mixture
+    if hparams.scale <= 0:
+        raise ValueError("noise without a density: take exploration.gaussian.scale above 0")
+
+
+def _scale_ornstein_uhlenbeck(
+    hparams: OrnsteinUhlenbeckHParams, factor: Numeric
+) -> OrnsteinUhlenbeckHParams:
+    return hparams.replace(sigma=factor * hparams.sigma)
+
+
+def _check_ornstein_uhlenbeck(
+    hparams: OrnsteinUhlenbeckHParams, *, trajectories: bool, mixture: bool
+) -> None:
+    if hparams.sigma <= 0 or not 0 < hparams.theta < 2:
+        raise ValueError(
+            "noise without a density: take exploration.ornstein_uhlenbeck.sigma above 0 and theta "
+            "between 0 and 2"
+        )
+    if trajectories and mixture:
+        raise ValueError(
+            "what noise another policy would have needed at the step before is not known: take "
+            "exploration.kind gaussian, or reward_batches.weights recorded"
+        )
+
+
+def _scale_epsilon_greedy(hparams: EpsilonGreedyHParams, factor: Numeric) -> EpsilonGreedyHParams:
+    start, end = factor * hparams.epsilon_start, factor * hparams.epsilon_end
+    checks.shares(
+        **{
+            "exploration.epsilon_greedy.epsilon_start times hot_start_factor": start,
+            "exploration.epsilon_greedy.epsilon_end times hot_start_factor": end,
+        }
+    )
+    return hparams.replace(epsilon_start=start, epsilon_end=end)
+
+
+def _check_epsilon_greedy(
+    hparams: EpsilonGreedyHParams, *, trajectories: bool, mixture: bool
+) -> None:
+    if trajectories and hparams.hold > 1:
+        raise ValueError(
+            "a trajectory of held random actions has no density to weight it by: take "
+            "reward_batches.weights uniform, or exploration.epsilon_greedy.hold 1"
+        )
+    if hparams.noise is None and (trajectories or mixture):
+        raise ValueError(
+            "a greedy action without noise has no density to weight it by: take "
+            "reward_batches.weights uniform, or give exploration.epsilon_greedy.noise"
+        )
+    if hparams.noise is not None and hparams.noise <= 0:
+        raise ValueError("take exploration.epsilon_greedy.noise above 0, or leave it out")
+
+
+EXPLORATIONS: Registry[ExplorationKind] = Registry(
+    "exploration",
+    {
+        "ornstein-uhlenbeck": ExplorationKind(
+            make=ornstein_uhlenbeck,
+            hparams=lambda settings: settings.ornstein_uhlenbeck,
+            scale=_scale_ornstein_uhlenbeck,
+            check_density=_check_ornstein_uhlenbeck,
+        ),
+        "gaussian": ExplorationKind(
+            make=gaussian,
+            hparams=lambda settings: settings.gaussian,
+            scale=_scale_gaussian,
+            check_density=_check_gaussian,
+        ),
+        "epsilon-greedy": ExplorationKind(
+            make=epsilon_greedy,
+            hparams=lambda settings: settings.epsilon_greedy,
+            scale=_scale_epsilon_greedy,
+            check_density=_check_epsilon_greedy,
+        ),
+    },
+)
+"""Maps each name to its exploration."""

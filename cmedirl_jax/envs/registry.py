@@ -1,17 +1,36 @@
-"""Which environments there are, by Gymnasium's names."""
+"""The environments, by Gymnasium's names."""
+
+from collections.abc import Callable
 
 from cmedirl_jax.envs import mountain_car
 from cmedirl_jax.envs.base import Env
+from cmedirl_jax.registries import Registry
 
-_MAKERS = {mountain_car.SPEC.id: mountain_car.make}
+ENVS: Registry[Callable[[], Env]] = Registry(
+    "environment", {mountain_car.SPEC.id: mountain_car.make}
+)
+"""Maps each name to the function that makes the environment."""
 
 
 def make(id: str) -> Env:
-    """Make an environment by its Gymnasium name.
+    """Make an environment by its name.
 
     Raises:
-        ValueError: if there is no such environment; the message names those there are.
+        ValueError: if there is no such environment; the message lists those there are.
     """
-    if id not in _MAKERS:
-        raise ValueError(f"unknown environment {id!r}; there are: {', '.join(sorted(_MAKERS))}")
-    return _MAKERS[id]()
+    return ENVS[id]()
+
+
+def register(id: str, make: Callable[[], Env]) -> None:
+    """Add an environment of your own, to be made by its name.
+
+    Args:
+        id: the name.
+        make: makes the environment, whose `spec.id` is that name.
+
+    Raises:
+        ValueError: if the name is taken.
+    """
+    if id in ENVS:
+        raise ValueError(f"environment {id!r} is already registered")
+    ENVS[id] = make

@@ -5,7 +5,6 @@ state = learner.init(jax.random.key(0))
 state, info = jax.jit(learner.update)(state, demonstrations, background)
 """
 
-import functools
 from typing import Annotated, Any, NamedTuple
 
 import flax.struct
@@ -17,11 +16,11 @@ import optax
 from cmedirl_jax import checks, optimizers
 from cmedirl_jax.irl import base, objectives, regularisers, rewards
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
-from cmedirl_jax.irl.objectives import Likelihood, Objective, Scored
+from cmedirl_jax.irl.objectives import OBJECTIVES, Likelihood, ObjectiveName
 from cmedirl_jax.irl.regularisers import BoundKind, Gauge
 from cmedirl_jax.optimizers import traced
 from cmedirl_jax.ranges import POSITIVE, NotNegative, Share
-from cmedirl_jax.types import EnvSpec, Network, Numeric, Params, RewardBatch, Transition
+from cmedirl_jax.types import EnvSpec, Network, Params, RewardBatch, Transition
 
 
 class IRLHParams(flax.struct.PyTreeNode):
@@ -69,7 +68,7 @@ class IRLHParams(flax.struct.PyTreeNode):
     discount: Share = 1.0
     weight_exponent: NotNegative = 1.0
     weight_limit: NotNegative | None = None
-    objective: Objective = flax.struct.field(pytree_node=False, default="visitation")
+    objective: ObjectiveName = flax.struct.field(pytree_node=False, default="visitation")
     bounded_by: BoundKind = flax.struct.field(pytree_node=False, default="tanh")
     gauge: Gauge = flax.struct.field(pytree_node=False, default="none")
     absorbing: bool = flax.struct.field(pytree_node=False, default=False)
@@ -115,13 +114,14 @@ def make(
             *negative* posterior, to descend.
 
     Raises:
-        ValueError: if the specification does not agree with itself.
+        ValueError: if the specification does not agree with itself, or there is no such objective.
     """
     checks.env_spec(spec)
     hparams = hparams or IRLHParams()
     network = network or rewards.mlp(spec)
     tx = optax.with_extra_args_support(optimizer or optimizers.adam())
-    checked = base.trajectories if hparams.objective == "trajectory" else base.pairs
+    trajectories = OBJECTIVES[hparams.objective].trajectories
+    checked = base.trajectories if trajectories else base.pairs
     units = _units(spec)
 
     def init(key: jax.Array) -> RewardState:
@@ -227,40 +227,17 @@ def log_likelihood(
         found: r_D of each batch's pairs, `[B]`, or `[M * T]` for trajectories.
         absorbed: `[]`, r_D of the absorbing state, or None without one.
     """
-    score = _score_pairs
-    if hparams.objective == "trajectory":
-        score = functools.partial(_score_trajectories, discount=hparams.discount)
-    append = hparams.append_demonstrations
+    objective, append = OBJECTIVES[hparams.objective], hparams.append_demonstrations
     demonstrations, background = objectives.weighed(
-        *(score(batch, r_d, absorbed) for batch, r_d in zip(batches, found, strict=True)),
+        *(
+            objective.score(batch, r_d, absorbed, hparams.discount)
+            for batch, r_d in zip(batches, found, strict=True)
+        ),
         append=append,
         exponent=hparams.weight_exponent,
         limit=hparams.weight_limit,
     )
-    return getattr(objectives, hparams.objective)(demonstrations, background, append=append)
-
-
-def _score_pairs(batch: RewardBatch, r_d: jax.Array, absorbed: jax.Array | None) -> Scored:
-    scored = Scored(r_d, objectives.log_weight(batch.log_density), batch.mask)
-    if absorbed is None:
-        return scored
-    # After each termination one more sample, of the absorbing state.
-    follows = batch.mask & batch.transition.terminated
-    after = Scored(jnp.full_like(r_d, absorbed), scored.log_weight, follows)
-    return Scored(*map(jnp.concatenate, zip(scored, after, strict=True)))
-
-
-def _score_trajectories(
-    batch: RewardBatch, r_d: jax.Array, absorbed: jax.Array | None, *, discount: Numeric
-) -> Scored:
-    mask, r_d = batch.mask, r_d.reshape(batch.mask.shape)
-    some = jnp.any(mask, axis=-1)
-    if absorbed is not None:
-        # The absorbing state takes the rest of the horizon.
-        r_d = jnp.where(mask, r_d, absorbed)
-        mask |= jnp.any(mask & batch.transition.terminated, axis=-1, keepdims=True)
-    total = objectives.returns(r_d, mask, discount)
-    return Scored(total, objectives.log_weight(batch.log_density), some)
+    return objective.likelihood(demonstrations, background, append=append)
 
 
 def _steps(batch: RewardBatch) -> _Steps:

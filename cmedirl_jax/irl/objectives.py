@@ -14,15 +14,17 @@ from: uniform, or 1 / density. Appending the demonstrations to the samples (Algo
 keeps the two exponential objectives bounded; the linear one, of uniform weights, it only rescales.
 """
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
 from cmedirl_jax.irl.regularisers import masked_mean
-from cmedirl_jax.types import Numeric
+from cmedirl_jax.registries import Registry
+from cmedirl_jax.types import Numeric, RewardBatch
 
-Objective = Literal["visitation", "transition", "trajectory"]
+ObjectiveName = Literal["visitation", "transition", "trajectory"]
+"""The names in `OBJECTIVES`."""
 
 
 class Scored(NamedTuple):
@@ -49,6 +51,51 @@ class Likelihood(NamedTuple):
 
     value: jax.Array
     effective_sample_size: jax.Array
+
+
+class LikelihoodFn(Protocol):
+    """An estimate of L_D."""
+
+    def __call__(self, demonstrations: Scored, background: Scored, *, append: bool) -> Likelihood:
+        """Estimate L_D; `append`: the demonstrations join the samples (Algorithm 1, line 4)."""
+        ...
+
+
+class ScoreFn(Protocol):
+    """A batch under a reward."""
+
+    def __call__(
+        self,
+        batch: RewardBatch,
+        reward: jax.Array,
+        absorbed: jax.Array | None,
+        discount: Numeric,
+    ) -> Scored:
+        """Score a batch.
+
+        Args:
+            batch: pairs or trajectories.
+            reward: `[B]` or `[M * T]`, r_D of each step of the batch.
+            absorbed: `[]`, r_D of the absorbing state; None without one.
+            discount: `[]`, of a trajectory's return.
+        """
+        ...
+
+
+class Objective(NamedTuple):
+    """All that belongs to an objective's name.
+
+    Attributes:
+        likelihood: see `LikelihoodFn`.
+        score: see `ScoreFn`.
+        trajectories: it takes batches of whole trajectories, not of pairs.
+        needs_bound: nothing in it bounds the reward of an absorbing state; `bounded_by` has to.
+    """
+
+    likelihood: LikelihoodFn
+    score: ScoreFn
+    trajectories: bool = False
+    needs_bound: bool = False
 
 
 def visitation(demonstrations: Scored, background: Scored, *, append: bool) -> Likelihood:
@@ -93,6 +140,32 @@ def trajectory(demonstrations: Scored, background: Scored, *, append: bool) -> L
         append: whether the demonstrations join the samples.
     """
     return _log_partition_likelihood(demonstrations, background, append)
+
+
+def score_pairs(
+    batch: RewardBatch, reward: jax.Array, absorbed: jax.Array | None, discount: Numeric
+) -> Scored:
+    """Score pairs; one more sample, of the absorbing state, follows each termination."""
+    del discount
+    scored = Scored(reward, log_weight(batch.log_density), batch.mask)
+    if absorbed is None:
+        return scored
+    follows = batch.mask & batch.transition.terminated
+    after = Scored(jnp.full_like(reward, absorbed), scored.log_weight, follows)
+    return Scored(*map(jnp.concatenate, zip(scored, after, strict=True)))
+
+
+def score_trajectories(
+    batch: RewardBatch, reward: jax.Array, absorbed: jax.Array | None, discount: Numeric
+) -> Scored:
+    """Score trajectories; after a termination the absorbing state takes the rest of the horizon."""
+    mask, reward = batch.mask, reward.reshape(batch.mask.shape)
+    some = jnp.any(mask, axis=-1)
+    if absorbed is not None:
+        reward = jnp.where(mask, reward, absorbed)
+        mask |= jnp.any(mask & batch.transition.terminated, axis=-1, keepdims=True)
+    total = returns(reward, mask, discount)
+    return Scored(total, log_weight(batch.log_density), some)
 
 
 def returns(reward: jax.Array, mask: jax.Array, discount: Numeric = 1.0) -> jax.Array:
@@ -185,3 +258,14 @@ def _normalised(log_weight: jax.Array, counts: jax.Array) -> jax.Array:
     largest = jax.lax.stop_gradient(jnp.max(log_weight, initial=-jnp.inf, where=counts))
     weight = jnp.where(counts, jnp.exp(jnp.where(counts, log_weight - largest, 0.0)), 0.0)
     return weight / jnp.maximum(jnp.sum(weight), 1.0)
+
+
+OBJECTIVES: Registry[Objective] = Registry(
+    "objective",
+    {
+        "visitation": Objective(visitation, score_pairs, needs_bound=True),
+        "transition": Objective(transition, score_pairs),
+        "trajectory": Objective(trajectory, score_trajectories, trajectories=True),
+    },
+)
+"""Maps each name to its objective."""

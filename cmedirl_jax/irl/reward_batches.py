@@ -16,7 +16,7 @@ from cmedirl_jax.agents.exploration import Exploration
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.data.replay import Replay, ReplayState
 from cmedirl_jax.irl import sample_sources, sample_weights
-from cmedirl_jax.irl.objectives import Objective
+from cmedirl_jax.irl.objectives import OBJECTIVES, ObjectiveName
 from cmedirl_jax.irl.sample_sources import SampleSource
 from cmedirl_jax.irl.sample_weights import SampleWeights
 from cmedirl_jax.networks import ActorCritic
@@ -109,7 +109,7 @@ def make(
     capacity: int,
     settings: RewardBatchSettings,
     *,
-    objective: Objective = "visitation",
+    objective: ObjectiveName = "visitation",
     append: bool = True,
 ) -> RewardSampler:
     """Make the sampler of a reward learner.
@@ -158,9 +158,9 @@ def _source(
     replay: Replay,
     capacity: int,
     settings: RewardBatchSettings,
-    objective: Objective,
+    objective: ObjectiveName,
 ) -> SampleSource:
-    if objective != "trajectory":
+    if not OBJECTIVES[objective].trajectories:
         return sample_sources.pairs(replay, settings.batch_size, settings.recent)
     return sample_sources.trajectories(
         replay,

@@ -6,14 +6,17 @@ All take an observation `[..., O]` and an action `[..., A]`, floats with the sam
 ValueError, or TypeError for other dtypes; those of the inputs "state" ignore the action.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax import checks, grids, networks
+from cmedirl_jax.ranges import AtLeastTwo, Size
+from cmedirl_jax.registries import Registry
 from cmedirl_jax.types import Array, EnvSpec, Network, Params
 
 Inputs = Literal["state-action", "state"]
@@ -21,6 +24,59 @@ Inputs = Literal["state-action", "state"]
 
 Features = Callable[[Array, Array], jax.Array]
 """phi: observation `[..., O]`, action `[..., A]` -> `[..., F]`."""
+
+NetworkName = Literal["deep", "radial-basis", "fourier"]
+"""The names in `NETWORKS`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RewardNetworkSettings:
+    """The reward network. All static.
+
+    Attributes:
+        kind: A perceptron, or theta^T phi (Eq. 1) with one of two kinds of features.
+        inputs: r(s, a), or r(s).
+        hidden: Units of each hidden layer of a deep reward.
+        centres: Radial basis functions along each dimension of the observation.
+        order: Highest frequency of the Fourier basis, along each dimension of its inputs.
+    """
+
+    kind: NetworkName = "deep"
+    inputs: Inputs = "state-action"
+    hidden: tuple[Size, ...] = (64, 64)
+    centres: AtLeastTwo = 9
+    order: Size = 3
+
+
+class NetworkKind(NamedTuple):
+    """All that belongs to the name of a kind of reward network.
+
+    Attributes:
+        make: `(spec, settings, inputs) -> Network`; of the settings it reads its own fields.
+        starts_at_zero: its first parameters give r_D = 0 everywhere, so that a random reward
+            cannot be made of it.
+    """
+
+    make: Callable[[EnvSpec, RewardNetworkSettings, Inputs], Network]
+    starts_at_zero: bool = False
+
+
+def make(
+    spec: EnvSpec, settings: RewardNetworkSettings | None = None, *, state_only: bool = False
+) -> Network:
+    """The network that `settings.kind` names, before any bound.
+
+    Args:
+        spec: the environment's sizes and bounds.
+        settings: the kind, and its sizes.
+        state_only: make r(s), as a potential needs, whatever `settings.inputs` says.
+
+    Raises:
+        ValueError: for an unknown kind, or a specification that the kind cannot be made for.
+    """
+    settings = settings or RewardNetworkSettings()
+    inputs = "state" if state_only else settings.inputs
+    return NETWORKS[settings.kind].make(spec, settings, inputs)
 
 
 def mlp(
@@ -124,3 +180,22 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
         return jnp.cos(jnp.sum(x[..., None, :] * frequencies, axis=-1))
 
     return features
+
+
+NETWORKS: Registry[NetworkKind] = Registry(
+    "kind of reward network",
+    {
+        "deep": NetworkKind(lambda spec, settings, inputs: mlp(spec, settings.hidden, inputs)),
+        "radial-basis": NetworkKind(
+            lambda spec, settings, inputs: linear(
+                spec, radial_basis(spec, settings.centres, inputs)
+            ),
+            starts_at_zero=True,
+        ),
+        "fourier": NetworkKind(
+            lambda spec, settings, inputs: linear(spec, fourier(spec, settings.order, inputs)),
+            starts_at_zero=True,
+        ),
+    },
+)
+"""Maps each name to its kind of reward network."""

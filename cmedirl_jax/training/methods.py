@@ -4,17 +4,13 @@ import dataclasses
 from typing import Literal, NamedTuple
 
 from cmedirl_jax.agents.ddpg import DDPGHParams
-from cmedirl_jax.agents.exploration import (
-    EpsilonGreedyHParams,
-    GaussianHParams,
-    OrnsteinUhlenbeckHParams,
-)
+from cmedirl_jax.agents.exploration import ExplorationSettings
 from cmedirl_jax.agents.hot_start import HotStartHParams
 from cmedirl_jax.irl import GAILHParams, IRLHParams
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
+from cmedirl_jax.irl.rewards import RewardNetworkSettings
 from cmedirl_jax.irl.shaping import Shaping
 from cmedirl_jax.networks import Architecture
-from cmedirl_jax.ranges import AtLeastTwo, Positive, Size
 from cmedirl_jax.tabular import imitation
 from cmedirl_jax.tabular.imitation import TabularSettings
 from cmedirl_jax.training.schedules import RewardSchedule, Schedule
@@ -91,42 +87,6 @@ METHODS: dict[str, Method] = {
 
 PAPER_METHODS = ("ddpg", "hs-ddpg", "me-ddpg", "hs-me-ddpg")
 """The four that the paper names."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ExplorationSettings:
-    """The behaviour policy.
-
-    Attributes:
-        kind: Which noise; the options of the others are ignored.
-        hot_start_factor: Factor on the noise of a hot-started method: on sigma, on the scale, or on
-            both epsilons.
-    """
-
-    kind: Literal["ornstein-uhlenbeck", "gaussian", "epsilon-greedy"] = "ornstein-uhlenbeck"
-    hot_start_factor: Positive = 1.0
-    ornstein_uhlenbeck: OrnsteinUhlenbeckHParams = OrnsteinUhlenbeckHParams()
-    gaussian: GaussianHParams = GaussianHParams()
-    epsilon_greedy: EpsilonGreedyHParams = EpsilonGreedyHParams()
-
-
-@dataclasses.dataclass(frozen=True)
-class RewardNetworkSettings:
-    """The reward network. All static.
-
-    Attributes:
-        kind: A perceptron, or theta^T phi (Eq. 1) with one of two kinds of features.
-        inputs: r(s, a), or r(s).
-        hidden: Units of each hidden layer of a deep reward.
-        centres: Radial basis functions along each dimension of the observation.
-        order: Highest frequency of the Fourier basis, along each dimension of its inputs.
-    """
-
-    kind: Literal["deep", "radial-basis", "fourier"] = "deep"
-    inputs: Literal["state-action", "state"] = "state-action"
-    hidden: tuple[Size, ...] = (64, 64)
-    centres: AtLeastTwo = 9
-    order: Size = 3
 
 
 @dataclasses.dataclass(frozen=True)
