@@ -22,7 +22,7 @@ from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import checkpoints
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
-from cmedirl_jax.training.methods import Settings
+from cmedirl_jax.training.settings import Settings
 
 
 @dataclasses.dataclass(frozen=True)

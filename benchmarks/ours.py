@@ -12,14 +12,16 @@ from cmedirl_jax.agents import hot_start
 from cmedirl_jax.agents.hot_start import HotStartHParams
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
+from cmedirl_jax.irl.rewards import RewardNetworkSettings
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.training import seeds
-from cmedirl_jax.training.methods import METHODS, RewardNetworkSettings, Settings
+from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.schedules import RewardSchedule, Schedule
+from cmedirl_jax.training.settings import Settings
 
 
 def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:

@@ -23,7 +23,8 @@ from benchmarks.workload import CAPACITY
 from cmedirl_jax import envs, training
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.training import seeds
-from cmedirl_jax.training.methods import METHODS, Settings
+from cmedirl_jax.training.methods import METHODS
+from cmedirl_jax.training.settings import Settings
 
 STEPS = 250
 

@@ -27,7 +27,7 @@ from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.runs.cluster import exchange
 from cmedirl_jax.training import seeds
-from cmedirl_jax.training.methods import Settings
+from cmedirl_jax.training.settings import Settings
 
 GROUPS = {"1 process x 2 devices": (1, 2), "2 processes x 1 device": (2, 1), "its share": (1, 1)}
 """Processes, and devices of each."""

@@ -7,7 +7,8 @@ from cmedirl_jax.io import checkpoint
 from cmedirl_jax.irl import reward_batches as background
 from cmedirl_jax.irl import rewards, shaping
 from cmedirl_jax.training import evaluation, schedules, seeds
-from cmedirl_jax.training.methods import METHODS, Method, Settings
+from cmedirl_jax.training.methods import METHODS, Method
+from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.types import EnvSpec, Network, RewardBatch, Transition
 
 __all__ = [

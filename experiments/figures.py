@@ -14,24 +14,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cmedirl_jax.runs import statistics
+from cmedirl_jax.training.methods import METHODS
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#000000")
-LABELS = {
-    "ddpg": "DDPG",
-    "hs-ddpg": "HS-DDPG",
-    "me-ddpg": "ME-DDPG",
-    "hs-me-ddpg": "HS-ME-DDPG",
-    "tabular-me-ddpg": "tabular ME-DDPG",
-    "maxent-irl": "MaxEnt IRL",
-    "deep-maxent-irl": "deep MaxEnt IRL",
-    "bc": "behaviour cloning",
-    "irl-only": "$r_D$ alone",
-    "gail": "GAIL",
-    "ddpg-plus-constant": "DDPG, $r_e + c$",
-    "ddpg-minus-constant": "DDPG, $r_e - c$",
-    "random-reward": "DDPG, random $r_D$",
-}
 
 
 def draw(
@@ -145,7 +131,7 @@ def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None
         low, middle, high = (
             rows[column + end].cast(pl.Float64).to_numpy() for end in ("_low", "", "_high")
         )
-        label = LABELS.get(method, method)
+        label = METHODS[method].label or method
         if np.isnan(middle).all():
             continue
         if rows["n_demos"].max() == 0:
@@ -183,7 +169,7 @@ def _band(
     intervals = np.array([statistics.mean(values.to_numpy()) for values in points[y]])
     if not len(intervals):
         return
-    label = LABELS.get(method, method)
+    label = METHODS[method].label or method
     if len(intervals) == 1:
         # Of a method that never interacts: the same at every step.
         axes.axhline(intervals[0, 0], **line | {"linestyle": "-."}, label=label)

@@ -1,13 +1,14 @@
 """The three configurations with a name: `tuned`, `paper` and `smoke`."""
 
 from cmedirl_jax.agents.ddpg import DDPGHParams
+from cmedirl_jax.agents.exploration import ExplorationSettings
 from cmedirl_jax.agents.hot_start import HotStartHParams
 from cmedirl_jax.irl import IRLHParams
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
 from cmedirl_jax.runs.config import ExpertSettings, StudyConfig
 from cmedirl_jax.tabular.imitation import TabularSettings
-from cmedirl_jax.training.methods import ExplorationSettings, Settings
 from cmedirl_jax.training.schedules import RewardSchedule, Schedule
+from cmedirl_jax.training.settings import Settings
 
 # What section 4.1 and Algorithms 1 and 2 state. What they leave open keeps the tuned value.
 _PAPER_SETTINGS = Settings(

@@ -10,7 +10,8 @@ from cmedirl_jax.data import demonstrations, episodes, replay
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.irl import rewards, shaping
 from cmedirl_jax.training import compose, schedules
-from cmedirl_jax.training.methods import METHODS, Settings
+from cmedirl_jax.training.methods import METHODS
+from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.types import RewardBatch, Transition
 
 

@@ -10,7 +10,8 @@ from cmedirl_jax import ranges
 from cmedirl_jax.agents.ddpg import DDPGHParams
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.training import compose
-from cmedirl_jax.training.methods import METHODS, Settings
+from cmedirl_jax.training.methods import METHODS
+from cmedirl_jax.training.settings import Settings
 
 
 def with_tau(tau):

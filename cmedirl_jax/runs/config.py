@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import tyro
 
 from cmedirl_jax.ranges import Count, NotNegative, Range, Size
-from cmedirl_jax.training.methods import PAPER_METHODS, Settings
+from cmedirl_jax.training.methods import PAPER_METHODS
+from cmedirl_jax.training.settings import Settings
 
 Expert = Literal["best", "median", "all"]
 

@@ -38,7 +38,8 @@ from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import sealing, tables
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.runs.validation import Cell
-from cmedirl_jax.training.methods import METHODS, Method, Settings
+from cmedirl_jax.training.methods import METHODS, Method
+from cmedirl_jax.training.settings import Settings
 
 FRESH_STARTS = 100
 """Random start states on which each seed's best policy is evaluated at the end."""

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 
 from cmedirl_jax import envs, networks, ranges
+from cmedirl_jax.agents.exploration import ExplorationSettings
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
@@ -14,7 +15,7 @@ from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.tabular import imitation
 from cmedirl_jax.training import compose
-from cmedirl_jax.training.methods import METHODS, ExplorationSettings, Method
+from cmedirl_jax.training.methods import METHODS, Method
 
 
 class Cell(NamedTuple):

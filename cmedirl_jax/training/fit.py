@@ -9,11 +9,12 @@ from cmedirl_jax.agents import hot_start
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
-from cmedirl_jax.training import evaluation, methods
+from cmedirl_jax.training import evaluation
 from cmedirl_jax.training import seeds as seeds_lib
 from cmedirl_jax.training.evaluation import Evaluation
 from cmedirl_jax.training.initialise import TrainingState
-from cmedirl_jax.training.methods import Method, Settings
+from cmedirl_jax.training.methods import METHODS, Method
+from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.training.step import Log
 from cmedirl_jax.training.trainer import make
 
@@ -65,9 +66,7 @@ def fit(
             `evaluate_every`, or what `make` refuses.
     """
     if isinstance(method, str):
-        if method not in methods.METHODS:
-            raise ValueError(f"unknown method {method!r}; there are: {', '.join(methods.METHODS)}")
-        method = methods.METHODS[method]
+        method = METHODS[method]
     if min(seeds, steps, evaluate_every, evaluation_starts) < 1:
         raise ValueError("seeds, steps, evaluate_every and evaluation_starts must be positive")
     if steps % evaluate_every:

@@ -18,7 +18,8 @@ from cmedirl_jax.irl import RewardState
 from cmedirl_jax.irl.reward_batches import SamplerState
 from cmedirl_jax.tabular import imitation, table_reward
 from cmedirl_jax.training.compose import Algorithm
-from cmedirl_jax.training.methods import Method, Settings
+from cmedirl_jax.training.methods import Method
+from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.types import Numeric, Params
 
 

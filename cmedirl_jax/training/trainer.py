@@ -27,8 +27,9 @@ from cmedirl_jax.training import compose, initialise, schedules, updates
 from cmedirl_jax.training import step as step_lib
 from cmedirl_jax.training.compose import Algorithm
 from cmedirl_jax.training.initialise import TrainingState
-from cmedirl_jax.training.methods import Method, Settings
+from cmedirl_jax.training.methods import Method
 from cmedirl_jax.training.schedules import Plan
+from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.training.step import Behaviour, Log, StepDraws, StepParts
 from cmedirl_jax.types import Numeric, Params
 

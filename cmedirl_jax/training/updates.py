@@ -16,8 +16,9 @@ from cmedirl_jax.data.replay import ReplayState
 from cmedirl_jax.irl import RewardInfo, RewardState, base, regularisers, shaping
 from cmedirl_jax.irl.reward_batches import SampleDraws
 from cmedirl_jax.training.compose import Algorithm
-from cmedirl_jax.training.methods import Method, Settings
+from cmedirl_jax.training.methods import Method
 from cmedirl_jax.training.schedules import Cloning, Plan
+from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.types import Numeric, RewardBatch, Transition
 
 
@@ -32,7 +33,6 @@ class UpdateParts(NamedTuple):
         stores_shaped: r* is stored in the replay in place of r_e.
         freezes_actor: a hot-started actor waits while the critic learns.
         always_moves_targets: the targets move at every update of the agent.
-        draws_penalty: the reward's update draws random numbers of its own.
     """
 
     algorithm: Algorithm
@@ -42,7 +42,6 @@ class UpdateParts(NamedTuple):
     stores_shaped: bool
     freezes_actor: bool
     always_moves_targets: bool
-    draws_penalty: bool
 
     @property
     def reward_samples(self) -> int:
@@ -62,7 +61,6 @@ def make_parts(algorithm: Algorithm, method: Method, settings: Settings) -> Upda
         stores_shaped=algorithm.learner is not None and reward_schedule.storage == "store",
         freezes_actor=method.hot_start and schedule.frozen_actor_steps > 0,
         always_moves_targets=schedule.target_period <= schedule.update_period,
-        draws_penalty=method.reward == "maxent" and settings.reward.gradient_penalty is not None,
     )
 
 
@@ -100,7 +98,7 @@ def draw(parts: UpdateParts, key: jax.Array, subset: DemonstrationSubset | None)
     return UpdateDraws(
         batch=replay.draw(batch_key, parts.batch_size),
         reward=SampleDraws(replay.draw(background_key, sampled), chosen),
-        penalty=jax.random.fold_in(key, 3) if parts.draws_penalty else None,
+        penalty=jax.random.fold_in(key, 3) if parts.algorithm.reward_draws else None,
         cloning=rows[:cloned],
     )
 

@@ -6,10 +6,12 @@ import pytest
 from cmedirl_jax import envs
 from cmedirl_jax.irl import IRLHParams
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
+from cmedirl_jax.irl.rewards import RewardNetworkSettings
 from cmedirl_jax.runs import validation
 from cmedirl_jax.training import compose
-from cmedirl_jax.training.methods import METHODS, RewardNetworkSettings, Settings
+from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.schedules import RewardSchedule
+from cmedirl_jax.training.settings import Settings
 from experiments.presets import PRESETS
 from experiments.run_grid import parse
 

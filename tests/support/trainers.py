@@ -10,9 +10,11 @@ from cmedirl_jax import training
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.agents.hot_start import HotStartHParams
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
+from cmedirl_jax.irl.rewards import RewardNetworkSettings
 from cmedirl_jax.networks import Architecture
-from cmedirl_jax.training.methods import METHODS, RewardNetworkSettings, Settings
+from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.schedules import RewardSchedule, Schedule
+from cmedirl_jax.training.settings import Settings
 from tests.support import pools
 
 LIMIT = 40

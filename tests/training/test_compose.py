@@ -13,8 +13,9 @@ from cmedirl_jax.agents.exploration import (
 )
 from cmedirl_jax.irl.rewards import RewardNetworkSettings
 from cmedirl_jax.training import compose
-from cmedirl_jax.training.methods import METHODS, Settings
+from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.schedules import RewardSchedule, Schedule
+from cmedirl_jax.training.settings import Settings
 
 SPEC = envs.make("MountainCarContinuous-v0").spec
 

@@ -16,8 +16,9 @@ from cmedirl_jax import training
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.agents.hot_start import HotStartHParams
 from cmedirl_jax.training import seeds
-from cmedirl_jax.training.methods import METHODS, PAPER_METHODS, Settings
+from cmedirl_jax.training.methods import METHODS, PAPER_METHODS
 from cmedirl_jax.training.schedules import Schedule
+from cmedirl_jax.training.settings import Settings
 from tests.support import pools
 
 GOLDEN = Path(__file__).with_name("golden.json")

@@ -11,7 +11,8 @@ import pytest
 from cmedirl_jax import training
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.training import seeds
-from cmedirl_jax.training.methods import METHODS, Settings
+from cmedirl_jax.training.methods import METHODS
+from cmedirl_jax.training.settings import Settings
 from tests.support import pools
 from tests.support.compiling import jit_as_users
 

@@ -17,7 +17,8 @@ from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.training import Log, TrainingState, seeds
-from cmedirl_jax.training.methods import METHODS, Method, Settings
+from cmedirl_jax.training.methods import METHODS, Method
+from cmedirl_jax.training.settings import Settings
 
 
 class CompiledMethod(NamedTuple):

@@ -20,7 +20,8 @@ from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.training import seeds
 from cmedirl_jax.training.evaluation import Evaluation
-from cmedirl_jax.training.methods import Method, Settings
+from cmedirl_jax.training.methods import Method
+from cmedirl_jax.training.settings import Settings
 
 
 class Fitted(NamedTuple):

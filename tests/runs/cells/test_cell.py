@@ -21,8 +21,9 @@ from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.console.signals import Interrupted, Interruption
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.training import Log
-from cmedirl_jax.training.methods import METHODS, Settings
+from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.schedules import Schedule
+from cmedirl_jax.training.settings import Settings
 from tests.support import pools
 
 SEEDS = 3

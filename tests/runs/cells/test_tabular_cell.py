@@ -12,7 +12,8 @@ from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.imitation import TabularSettings
 from cmedirl_jax.training import evaluation
-from cmedirl_jax.training.methods import METHODS, Settings
+from cmedirl_jax.training.methods import METHODS
+from cmedirl_jax.training.settings import Settings
 from tests.support import pools
 
 SETTINGS = Settings(tabular=TabularSettings(states=9, actions=3, steps=2, centres=3))

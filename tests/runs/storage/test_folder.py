@@ -11,7 +11,7 @@ from cmedirl_jax.irl import IRLHParams
 from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import folder as run_folder
-from cmedirl_jax.training.methods import Settings
+from cmedirl_jax.training.settings import Settings
 from experiments.presets import PRESETS
 from tests.support import damages
 
