@@ -49,6 +49,8 @@ def rollout(
 ) -> Rollouts:
     """Run `B` episodes side by side to their ends; stops as soon as the last one has ended.
 
+    An episode that the task has not ended after `env.spec.max_episode_steps` steps is cut there.
+
     Args:
         policy: observations `[B, O]` -> actions `[B, A]`.
         env: the environment.
@@ -65,7 +67,8 @@ def rollout(
     key = jax.random.key(0) if key is None else key
 
     def running(carry) -> jax.Array:
-        return ~jnp.all(carry[2])
+        _, _, done, _, time = carry
+        return ~jnp.all(done) & (time < env.spec.max_episode_steps)
 
     def act(observations: jax.Array) -> jax.Array:
         actions = policy(observations)

@@ -81,10 +81,12 @@ class StepParts(NamedTuple):
     Attributes:
         algorithm: the method's parts.
         updates: what its updates are made of.
+        max_episode_steps: steps after which an episode ends, whatever the task says.
     """
 
     algorithm: Algorithm
     updates: UpdateParts
+    max_episode_steps: int
 
 
 def step_keys(key: jax.Array, step: jax.Array) -> jax.Array:
@@ -124,7 +126,7 @@ def learn(
 ) -> tuple[TrainingState, Log]:
     """Do all that follows from the task's answer; see `trainer.Trainer`."""
     # Store the transition.
-    ended = answer.terminated | answer.truncated
+    ended = has_ended(parts, state, answer)
     transition = Transition(
         state.observation, behaviour.action, answer.reward, answer.observation, answer.terminated
     )
@@ -152,7 +154,13 @@ def learn(
     # Log, and go on.
     log = _log(state, answer, done, plan, losses, reward_info)
     state = state.replace(agent=agent, reward=reward, storage=replay_state.storage, sampler=sampler)
-    return _next_episode(parts, state, behaviour, answer, next_start, log), log
+    return _next_episode(parts, state, behaviour, answer, next_start, ended, log), log
+
+
+def has_ended(parts: StepParts, state: TrainingState, answer: Step) -> jax.Array:
+    """Whether the episode ends with this answer, by the task or by the specification's limit."""
+    at_limit = state.episode_length + 1 >= parts.max_episode_steps
+    return answer.terminated | answer.truncated | at_limit
 
 
 def _learn_reward(
@@ -247,10 +255,10 @@ def _next_episode(
     behaviour: Behaviour,
     answer: Step,
     next_start: jax.Array,
+    ended: jax.Array,
     log: Log,
 ) -> TrainingState:
     """Go on to the next observation, which begins another episode where this one has ended."""
-    ended = answer.terminated | answer.truncated
     reset = parts.algorithm.exploration.reset(behaviour.exploration)
     return state.replace(
         exploration=select(ended, reset, behaviour.exploration),

@@ -108,7 +108,11 @@ def make(
     plan = functools.partial(
         schedules.plan, schedule=settings.schedule, reward_schedule=settings.reward_schedule
     )
-    parts = StepParts(algorithm, updates.make_parts(algorithm, method, settings))
+    parts = StepParts(
+        algorithm,
+        updates.make_parts(algorithm, method, settings),
+        env.spec.max_episode_steps,
+    )
     if method.interacts:
         run = functools.partial(_run, parts, env, env_params, plan)
     else:
@@ -148,10 +152,10 @@ def _run(
         behaviour = step_lib.behave(parts, state, draws, now)
         env_state, answer = env.step(env_key, state.env, behaviour.action, env_params)
         first_state, first_observation = start
+        ended = step_lib.has_ended(parts, state, answer)
         state, log = step_lib.learn(
             parts, state, behaviour, answer, first_observation, draws, now, pool, max_episodes
         )
-        ended = answer.terminated | answer.truncated
         return state.replace(env=step_lib.select(ended, first_state, env_state)), log
 
     return jax.lax.scan(advance, state, (keys[:, 0], starts, draws, plans))

@@ -121,3 +121,16 @@ def test_other_actions_of_a_policy_are_refused(env, params, policy, error, messa
 def test_an_evaluation_needs_a_start(env, params):
     with pytest.raises(ValueError, match="starts must be at least 1, got 0"):
         evaluation.evaluate(bang_bang, env, params, 0)
+
+
+def test_an_episode_that_the_task_does_not_end_is_cut_at_the_specifications_limit(env):
+    endless = env._replace(
+        spec=env.spec._replace(max_episode_steps=30),
+        default_params=env.default_params.replace(max_episode_steps=10**6),
+    )
+    starts = endless.starts(3, endless.default_params)
+    rollouts = evaluation.rollout(
+        lambda observation: jnp.zeros((3, 1)), endless, endless.default_params, starts
+    )
+    np.testing.assert_array_equal(rollouts.length, [30, 30, 30])
+    assert not rollouts.terminated.any()

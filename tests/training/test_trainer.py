@@ -8,7 +8,7 @@ from cmedirl_jax import training
 from cmedirl_jax.data import replay
 from cmedirl_jax.training import seeds
 from cmedirl_jax.training.methods import METHODS
-from tests.support.trainers import ENV, LIMIT, compiled, data, start, with_
+from tests.support.trainers import ENV, LIMIT, SMALL, compiled, data, start, with_
 
 
 def stored(state, steps):
@@ -371,3 +371,15 @@ def test_a_tabular_reward_is_each_seeds_own_bounded_and_stays():
         np.asarray(after.agent.critic["params"]["Dense_0"]["kernel"])
         != np.asarray(state.agent.critic["params"]["Dense_0"]["kernel"])
     ).any()
+
+
+def test_an_episode_that_the_task_does_not_end_ends_at_the_specifications_limit():
+    endless = ENV._replace(default_params=ENV.default_params.replace(max_episode_steps=10**6))
+    trainer = training.make(endless, METHODS["ddpg"], SMALL, capacity=100)
+    state = jax.jit(trainer.init)(jax.random.key(0), None, 0)
+    state, log = jax.jit(trainer.run)(state, None, jnp.arange(2 * LIMIT + 1))
+    np.testing.assert_array_equal(np.flatnonzero(log.done), [LIMIT - 1, 2 * LIMIT - 1])
+    assert not log.terminated.any()
+    # The next episode begins anew, also in the task's own clock.
+    assert state.env.time == 1
+    assert not stored(state, 2 * LIMIT).terminated.any()
