@@ -57,7 +57,7 @@ def uniform() -> SampleWeights:
 
 def _zeros(state: None, samples: Samples, replay_state: Any, exploration_state: Any) -> jax.Array:
     del state, replay_state, exploration_state
-    return jnp.zeros(samples.mask.shape[:1])
+    return jnp.zeros(samples.mask.shape[:1], jnp.float32)
 
 
 class RecordedState(flax.struct.PyTreeNode):
@@ -92,7 +92,7 @@ def _init_recorded(
     replay_capacity: int,
 ) -> RecordedState:
     del actor
-    return RecordedState(jnp.zeros((replay_capacity,)), _fit(key, spec, pool, subset))
+    return RecordedState(jnp.zeros((replay_capacity,), jnp.float32), _fit(key, spec, pool, subset))
 
 
 def _record_density(
@@ -224,7 +224,7 @@ def _mixture_density(
 
     # The slots hold the latest snapshots, up to number `latest`; below 0 there is none yet.
     latest = (replay_state.count - 1) // parts.period
-    number = latest - (latest - jnp.arange(parts.snapshots)) % parts.snapshots
+    number = latest - (latest - jnp.arange(parts.snapshots, dtype=jnp.int32)) % parts.snapshots
     each = jax.vmap(of_snapshot)(state.snapshots, number * parts.period)
     of_policies = source.mixture(each, samples.mask, number >= 0)
     of_demonstrator = _demonstrator_density(

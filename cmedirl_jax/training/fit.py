@@ -96,7 +96,7 @@ def fit(
             state, log = trainer.run(state, data, steps)
             return state, (evaluate(state), log)
 
-        chunks = jnp.arange(steps).reshape(-1, evaluate_every)
+        chunks = jnp.arange(steps, dtype=jnp.int32).reshape(-1, evaluate_every)
         state, (later, log) = jax.lax.scan(chunk, state, chunks)
         evaluations = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), first, later)
         return Result(state, evaluations, jax.tree.map(lambda x: x.reshape(steps), log))

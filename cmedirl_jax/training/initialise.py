@@ -162,7 +162,7 @@ def _init(
         env=env_state,
         observation=observation,
         episode=jnp.zeros((), jnp.int32),
-        episode_return=jnp.zeros(()),
+        episode_return=jnp.zeros((), jnp.float32),
         episode_length=jnp.zeros((), jnp.int32),
         subset=subset,
     )

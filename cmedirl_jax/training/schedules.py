@@ -132,4 +132,4 @@ def _cloning_weight(step: jax.Array, schedule: Schedule) -> jax.Array:
 
 def _falling(step: jax.Array, steps: int) -> jax.Array:
     """From 1 at step 0 to 0 at `steps`, linearly."""
-    return jnp.maximum(1.0 - step / steps, 0.0)
+    return jnp.maximum(1.0 - step / jnp.float32(steps), 0.0)

@@ -209,9 +209,8 @@ def _learn_agent(
         )
         return agent, (info.critic_loss, info.q_mean)
 
-    return jax.lax.cond(
-        plan.learn, update, lambda agent: (agent, (jnp.zeros(()), jnp.zeros(()))), agent
-    )
+    none = jnp.zeros((), jnp.float32)
+    return jax.lax.cond(plan.learn, update, lambda agent: (agent, (none, none)), agent)
 
 
 def _keep_parameters(
