@@ -5,6 +5,7 @@ state = agent.init(jax.random.key(0))
 state, info = jax.jit(agent.update)(state, batch)
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
@@ -25,19 +26,19 @@ class DDPGHParams(flax.struct.PyTreeNode):
     """Hyperparameters. The numbers are traced leaves of the state, to vmap over or to change.
 
     Attributes:
-        discount: Discount of the return, gamma.
-        tau: Share of the online parameters in each target update; 1 copies them.
-        actor_learning_rate: Adam's rate for the actor.
-        critic_learning_rate: Adam's rate for the critic.
-        reward_scale: Factor on every reward the critic learns from.
+        discount: Discount gamma of the return, per environment step.
+        tau: Share of the online parameters in each update of the targets; 1 copies them.
+        actor_learning_rate: Adam's rate for the actor, per update.
+        critic_learning_rate: Adam's rate for the critic, per update.
+        reward_scale: Factor on every reward that the critic learns from.
         pre_activation_penalty: Weight of the mean squared pre-activation in the actor's loss; keeps
-            tanh off its ends.
-        behaviour_cloning: Weight of the actor's squared error on the demonstrations passed to
-            `update`; the `tuned` preset sets 1.
+            the tanh from saturating.
+        behaviour_cloning: Weight of the actor's mean squared error on demonstrated actions (in
+            units of the action); the `tuned` preset sets 1.
         q_filter: Clone only the actions that the critic values above the actor's own (Nair et al.
             2018).
-        bootstrap_at_termination: Leave (1 - terminated) out of the target, as Algorithm 2 is
-            printed.
+        bootstrap_at_termination: Leave (1 - terminated) out of the critic's target, as Algorithm 2
+            is printed.
     """
 
     discount: Share = 0.99
@@ -52,7 +53,17 @@ class DDPGHParams(flax.struct.PyTreeNode):
 
 
 class DDPGState(flax.struct.PyTreeNode):
-    """Everything that `update` changes, and the hyperparameters it reads."""
+    """Everything that `update` changes, and the hyperparameters that it reads.
+
+    Attributes:
+        actor: parameters of the actor.
+        critic: parameters of the critic.
+        target_actor: parameters of the target actor.
+        target_critic: parameters of the target critic.
+        actor_optimizer: state of the actor's optimiser.
+        critic_optimizer: state of the critic's optimiser.
+        hparams: the hyperparameters, numbers as `[]` float32.
+    """
 
     actor: Params
     critic: Params
@@ -98,15 +109,17 @@ class UpdateFn(Protocol):
         update_targets: Numeric = True,
         clone: Numeric = True,
     ) -> tuple[DDPGState, DDPGInfo]:
-        """Update on `batch`, leaves `[B, ...]`, whose rewards are those to learn from.
+        """Update on a batch.
+
+        The three switches are bools, or scalar predicates that must not be batched under vmap.
 
         Args:
             state: the state before.
-            batch: transitions.
-            demonstrations: `[D, ...]` for the behaviour-cloning term, or None to leave it out.
-            update_actor: bool, or a scalar predicate that must not be batched under vmap.
-            update_targets: likewise; "every 300 steps" is a predicate and tau = 1.
-            clone: likewise; add the behaviour-cloning term, where there are demonstrations.
+            batch: transitions, leaves `[B, ...]`; their rewards are those to learn from.
+            demonstrations: leaves `[D, ...]`, for the behaviour-cloning term; None: no such term.
+            update_actor: whether the actor learns.
+            update_targets: whether the targets move; "every 300 steps" is a predicate and tau = 1.
+            clone: whether the behaviour-cloning term is added, if there are demonstrations.
 
         Raises:
             ValueError: if the batch's shapes are not `[B, O]`, `[B, A]` and `[B]`.
@@ -125,7 +138,8 @@ class DDPG(NamedTuple):
         value: `(state, observation [..., O], action [..., A]) -> [...]`, Q(s, a).
         update: see `UpdateFn`.
 
-    While tracing they raise ValueError for other shapes and TypeError for other dtypes.
+    `act`, `value` and `update` raise ValueError for wrong shapes and TypeError for wrong dtypes,
+    while tracing.
     """
 
     networks: ActorCritic
@@ -150,115 +164,157 @@ def make(
         hparams: the initial hyperparameters.
         networks: default `networks.make(spec)`.
         actor_optimizer: default Adam at `state.hparams.actor_learning_rate`. Any other optax
-            transformation holds its own rate, or reads `learning_rate=` as an extra argument.
-        critic_optimizer: likewise.
+            transformation has a rate of its own, or reads the extra argument `learning_rate=`.
+        critic_optimizer: the same for the critic.
 
     Raises:
         ValueError: if the specification does not agree with itself.
     """
     checks.env_spec(spec)
-    hparams = hparams or DDPGHParams()
-    networks = networks or networks_lib.make(spec)
-    actor_tx = optax.with_extra_args_support(actor_optimizer or optimizers.adam())
-    critic_tx = optax.with_extra_args_support(critic_optimizer or optimizers.adam())
+    parts = _Parts(
+        spec=spec,
+        networks=networks or networks_lib.make(spec),
+        actor_optimizer=optax.with_extra_args_support(actor_optimizer or optimizers.adam()),
+        critic_optimizer=optax.with_extra_args_support(critic_optimizer or optimizers.adam()),
+    )
+    return DDPG(
+        networks=parts.networks,
+        init=functools.partial(_init, parts, hparams or DDPGHParams()),
+        act=functools.partial(_act, parts),
+        value=functools.partial(_value, parts),
+        update=functools.partial(_update, parts),
+    )
 
-    def init(key: jax.Array, params: tuple[Params, Params] | None = None) -> DDPGState:
-        if params is None:
-            actor_key, critic_key = jax.random.split(key)
-            params = networks.actor.init(actor_key), networks.critic.init(critic_key)
-        actor, critic = params
-        return DDPGState(
-            actor=actor,
-            critic=critic,
-            # Copies: a donated state must not hold the same buffer twice.
-            target_actor=jax.tree.map(jnp.copy, actor),
-            target_critic=jax.tree.map(jnp.copy, critic),
-            actor_optimizer=actor_tx.init(actor),
-            critic_optimizer=critic_tx.init(critic),
-            hparams=traced(hparams),
+
+class _Parts(NamedTuple):
+    """What the functions of one `DDPG` share. All static."""
+
+    spec: EnvSpec
+    networks: ActorCritic
+    actor_optimizer: optax.GradientTransformationExtraArgs
+    critic_optimizer: optax.GradientTransformationExtraArgs
+
+
+def _init(
+    parts: _Parts,
+    hparams: DDPGHParams,
+    key: jax.Array,
+    params: tuple[Params, Params] | None = None,
+) -> DDPGState:
+    if params is None:
+        actor_key, critic_key = jax.random.split(key)
+        params = parts.networks.actor.init(actor_key), parts.networks.critic.init(critic_key)
+    actor, critic = params
+    return DDPGState(
+        actor=actor,
+        critic=critic,
+        # Copies: a donated state must not hold the same buffer twice.
+        target_actor=jax.tree.map(jnp.copy, actor),
+        target_critic=jax.tree.map(jnp.copy, critic),
+        actor_optimizer=parts.actor_optimizer.init(actor),
+        critic_optimizer=parts.critic_optimizer.init(critic),
+        hparams=traced(hparams),
+    )
+
+
+def _act(parts: _Parts, state: DDPGState, observation: jax.Array) -> jax.Array:
+    checks.pairs(parts.spec, observation)
+    return networks_lib.policy(parts.networks, state.actor, observation)
+
+
+def _value(parts: _Parts, state: DDPGState, observation: jax.Array, action: jax.Array) -> jax.Array:
+    checks.pairs(parts.spec, observation, action)
+    return parts.networks.critic.apply(state.critic, observation, action)
+
+
+def _update(
+    parts: _Parts,
+    state: DDPGState,
+    batch: Transition,
+    demonstrations: Transition | None = None,
+    *,
+    update_actor: Numeric = True,
+    update_targets: Numeric = True,
+    clone: Numeric = True,
+) -> tuple[DDPGState, DDPGInfo]:
+    for name, transitions in (("batch", batch), ("demonstrations", demonstrations)):
+        if transitions is not None:
+            leading = jnp.shape(transitions.observation)[:1]
+            checks.transition_shapes(parts.spec, transitions, leading, name)
+
+    # The critic first: the actor's gradient is taken through the new one.
+    state, td_loss, q_mean = _update_critic(parts, state, batch)
+    state, policy_loss = _when(
+        update_actor,
+        lambda state: _update_actor(parts, state, batch, demonstrations, clone),
+        lambda state: (state, jnp.zeros(())),
+        state,
+    )
+    state = _when(update_targets, _move_targets, lambda state: state, state)
+    return state, DDPGInfo(td_loss, q_mean, policy_loss)
+
+
+def _update_critic(
+    parts: _Parts, state: DDPGState, batch: Transition
+) -> tuple[DDPGState, jax.Array, jax.Array]:
+    """Take a gradient step of the critic; also its loss and the mean of Q(s, a), before it."""
+    targets = td_targets(parts.networks, state, batch)
+    (loss, (q, critic)), grads = jax.value_and_grad(critic_loss, argnums=1, has_aux=True)(
+        parts.networks, state.critic, batch, targets
+    )
+    updates, optimizer = parts.critic_optimizer.update(
+        grads, state.critic_optimizer, critic, learning_rate=state.hparams.critic_learning_rate
+    )
+    critic = optax.apply_updates(critic, updates)
+    return state.replace(critic=critic, critic_optimizer=optimizer), loss, jnp.mean(q)
+
+
+def _update_actor(
+    parts: _Parts,
+    state: DDPGState,
+    batch: Transition,
+    demonstrations: Transition | None,
+    clone: Numeric,
+) -> tuple[DDPGState, jax.Array]:
+    """Take a gradient step of the actor; also its loss, before it."""
+    (loss, actor), grads = jax.value_and_grad(actor_loss, argnums=1, has_aux=True)(
+        parts.networks, state.actor, state.critic, state.hparams, batch
+    )
+    if demonstrations is not None:
+        # A gradient of its own, so that the term costs nothing once it has faded out.
+        cloning_loss, cloning_grads = _when(
+            clone,
+            lambda actor: jax.value_and_grad(behaviour_cloning_loss, argnums=1)(
+                parts.networks, actor, state.critic, state.hparams, demonstrations
+            ),
+            lambda actor: (jnp.zeros(()), jax.tree.map(jnp.zeros_like, actor)),
+            actor,
         )
+        loss, grads = jax.tree.map(jnp.add, (loss, grads), (cloning_loss, cloning_grads))
+    updates, optimizer = parts.actor_optimizer.update(
+        grads, state.actor_optimizer, actor, learning_rate=state.hparams.actor_learning_rate
+    )
+    actor = optax.apply_updates(actor, updates)
+    return state.replace(actor=actor, actor_optimizer=optimizer), loss
 
-    def act(state: DDPGState, observation: jax.Array) -> jax.Array:
-        checks.pairs(spec, observation)
-        return networks_lib.policy(networks, state.actor, observation)
 
-    def value(state: DDPGState, observation: jax.Array, action: jax.Array) -> jax.Array:
-        checks.pairs(spec, observation, action)
-        return networks.critic.apply(state.critic, observation, action)
+def _move_targets(state: DDPGState) -> DDPGState:
+    """theta' <- tau theta + (1 - tau) theta' (Algorithm 2)."""
 
-    def update_critic(state: DDPGState, batch: Transition):
-        targets = td_targets(networks, state, batch)
-        (loss, (q, critic)), grads = jax.value_and_grad(critic_loss, argnums=1, has_aux=True)(
-            networks, state.critic, batch, targets
-        )
-        updates, optimizer = critic_tx.update(
-            grads, state.critic_optimizer, critic, learning_rate=state.hparams.critic_learning_rate
-        )
-        state = state.replace(
-            critic=optax.apply_updates(critic, updates), critic_optimizer=optimizer
-        )
-        return state, loss, jnp.mean(q)
+    def move(params: Params, target: Params) -> Params:
+        return optax.incremental_update(params, target, state.hparams.tau)
 
-    def update_actor_params(
-        state: DDPGState, batch: Transition, demonstrations: Transition | None, clone: Numeric
-    ):
-        (loss, actor), grads = jax.value_and_grad(actor_loss, argnums=1, has_aux=True)(
-            networks, state.actor, state.critic, state.hparams, batch
-        )
-        if demonstrations is not None:
-            # Apart from the loss above, so that a term that has faded out costs nothing.
-            cloning_loss, cloning_grads = _when(
-                clone,
-                lambda actor: jax.value_and_grad(behaviour_cloning_loss, argnums=1)(
-                    networks, actor, state.critic, state.hparams, demonstrations
-                ),
-                lambda actor: (jnp.zeros(()), jax.tree.map(jnp.zeros_like, actor)),
-                actor,
-            )
-            loss, grads = jax.tree.map(jnp.add, (loss, grads), (cloning_loss, cloning_grads))
-        updates, optimizer = actor_tx.update(
-            grads, state.actor_optimizer, actor, learning_rate=state.hparams.actor_learning_rate
-        )
-        actor = optax.apply_updates(actor, updates)
-        return state.replace(actor=actor, actor_optimizer=optimizer), loss
-
-    def move_targets(state: DDPGState) -> DDPGState:
-        def move(params: Params, target: Params) -> Params:
-            return optax.incremental_update(params, target, state.hparams.tau)
-
-        return state.replace(
-            target_actor=move(state.actor, state.target_actor),
-            target_critic=move(state.critic, state.target_critic),
-        )
-
-    def update(
-        state: DDPGState,
-        batch: Transition,
-        demonstrations: Transition | None = None,
-        *,
-        update_actor: Numeric = True,
-        update_targets: Numeric = True,
-        clone: Numeric = True,
-    ) -> tuple[DDPGState, DDPGInfo]:
-        checks.transition_shapes(spec, batch, jnp.shape(batch.observation)[:1], "batch")
-        if demonstrations is not None:
-            leading = jnp.shape(demonstrations.observation)[:1]
-            checks.transition_shapes(spec, demonstrations, leading, "demonstrations")
-        state, critic_loss_value, q_mean = update_critic(state, batch)
-        state, actor_loss_value = _when(
-            update_actor,
-            lambda state: update_actor_params(state, batch, demonstrations, clone),
-            lambda state: (state, jnp.zeros(())),
-            state,
-        )
-        state = _when(update_targets, move_targets, lambda state: state, state)
-        return state, DDPGInfo(critic_loss_value, q_mean, actor_loss_value)
-
-    return DDPG(networks, init, act, value, update)
+    return state.replace(
+        target_actor=move(state.actor, state.target_actor),
+        target_critic=move(state.critic, state.target_critic),
+    )
 
 
 def td_targets(networks: ActorCritic, state: DDPGState, batch: Transition) -> jax.Array:
-    """y = r + gamma (1 - terminated) Q'(s', mu'(s')), `[B]` (Algorithm 2; the mask is DDPG's)."""
+    """y = r + gamma (1 - terminated) Q'(s', mu'(s')), `[B]`.
+
+    Algorithm 2 prints it without (1 - terminated), which DDPG (Lillicrap et al. 2015) has.
+    """
     next_action = networks_lib.policy(networks, state.target_actor, batch.next_observation)
     next_value = networks.critic.apply(state.target_critic, batch.next_observation, next_action)
     if not state.hparams.bootstrap_at_termination:
@@ -269,7 +325,10 @@ def td_targets(networks: ActorCritic, state: DDPGState, batch: Transition) -> ja
 def critic_loss(
     networks: ActorCritic, critic: Params, batch: Transition, targets: jax.Array
 ) -> tuple[jax.Array, tuple[jax.Array, Params]]:
-    """L = 1/B sum_i (y_i - Q(s_i, a_i))^2 (Algorithm 2), with Q `[B]` and the parameters."""
+    """L = 1/B sum_i (y_i - Q(s_i, a_i))^2 `[]` (Algorithm 2); also Q `[B]` and the parameters.
+
+    The parameters returned are those given, with running statistics moved where there are any.
+    """
     q, critic = networks_lib.train_mode(networks.critic)(critic, batch.observation, batch.action)
     return jnp.mean(jnp.square(targets - q)), (q, critic)
 
@@ -277,7 +336,10 @@ def critic_loss(
 def actor_loss(
     networks: ActorCritic, actor: Params, critic: Params, hparams: DDPGHParams, batch: Transition
 ) -> tuple[jax.Array, Params]:
-    """-1/B sum_i Q(s_i, mu(s_i)), whose gradient is Eq. 3's, plus the pre-activation penalty."""
+    """-1/B sum_i Q(s_i, mu(s_i)), whose gradient is Eq. 3's, plus the pre-activation penalty.
+
+    Also the parameters, with running statistics moved where there are any.
+    """
     pre_activation, actor = networks_lib.train_mode(networks.actor)(actor, batch.observation)
     q = networks.critic.apply(critic, batch.observation, networks.squash(pre_activation))
     penalty = jnp.mean(jnp.square(pre_activation))
@@ -293,22 +355,23 @@ def behaviour_cloning_loss(
 ) -> jax.Array:
     """w 1/D sum_i |mu(s_i) - a_i|^2 on demonstrations `[D, ...]`, added to the actor's loss.
 
-    With `hparams.q_filter`, each term times 1{Q(s_i, a_i) > Q(s_i, mu(s_i))} (Nair et al. 2018).
+    `w` is `hparams.behaviour_cloning`. With `hparams.q_filter` each term is multiplied by
+    1{Q(s_i, a_i) > Q(s_i, mu(s_i))} (Nair et al. 2018).
     """
     observation, action = demonstrations.observation, demonstrations.action
     counts = None
     if hparams.q_filter:
-        # A comparison: no gradient passes.
+        # No gradient passes through a comparison.
         counts = networks.critic.apply(critic, observation, action) > networks.critic.apply(
             critic, observation, networks_lib.policy(networks, actor, observation)
         )
-    # The running statistics are the replay batch's alone to move.
+    # Only the replay batch moves the running statistics.
     error, _ = networks_lib.imitation_error(networks, actor, observation, action, counts)
     return hparams.behaviour_cloning * error
 
 
 def _when(predicate: Numeric, true_fn: Callable, false_fn: Callable, operand: Any) -> Any:
-    """`lax.cond` that a Python bool resolves while tracing."""
+    """`lax.cond`, decided while tracing if the predicate is a Python bool."""
     if isinstance(predicate, bool):
         return true_fn(operand) if predicate else false_fn(operand)
     return jax.lax.cond(predicate, true_fn, false_fn, operand)
