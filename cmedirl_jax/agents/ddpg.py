@@ -168,7 +168,7 @@ def make(
         critic_optimizer: the same for the critic.
 
     Raises:
-        ValueError: if the specification does not agree with itself.
+        ValueError: if the specification contradicts itself.
     """
     checks.env_spec(spec)
     parts = _Parts(

@@ -1,10 +1,15 @@
 """A ring buffer of transitions with uniform sampling (the paper's 'replay memory', section 4.1).
 
-A transition lies in one row of a packed `[capacity, D]` array: adding is one contiguous write and a
-minibatch one gather. The only counter is the number of transitions ever added; who fills many
-buffers in step may carry that number once, unbatched (`training` does).
+    buffer = replay.make(env.spec, capacity=10_000)
+    state = buffer.add(buffer.init(), transition)
+    batch = buffer.sample(key, state, batch_size=32)
+
+Each transition is one row of a packed `[capacity, D]` array: adding writes a contiguous row, and a
+minibatch is one gather. The only counter is the number of transitions ever added. Buffers that are
+filled in step can share that number, unbatched (`training` does so).
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -17,9 +22,12 @@ from cmedirl_jax.types import EnvSpec, Transition
 
 
 class ReplayState(flax.struct.PyTreeNode):
-    """The buffer: `storage` `[capacity, D]` float32 and `count` `[]` int32, transitions ever added.
+    """The buffer.
 
-    Row `count % capacity` is written next; `min(count, capacity)` rows are filled.
+    Attributes:
+        storage: `[capacity, D]` float32, packed transitions; `min(count, capacity)` rows are
+            filled, and row `count % capacity` is written next.
+        count: `[]` int32, transitions ever added.
     """
 
     storage: jax.Array
@@ -31,17 +39,19 @@ class Replay(NamedTuple):
 
     Attributes:
         init: `() -> ReplayState`, empty.
-        add: `(state, transition) -> ReplayState`; overwrites the oldest once full. One transition:
-            leaves `[O]`, `[A]` and `[]`, else ValueError, or TypeError for other dtypes.
-        sample: `(key, state, batch_size, recent=None) -> Transition`, leaves `[batch_size, ...]`:
-            uniform with replacement over what is there, or over its `recent` latest transitions.
-            An empty buffer gives zeros. ValueError if `batch_size` is negative, or `recent` not
-            positive.
+        add: `(state, transition) -> ReplayState`, with one more transition (leaves `[O]`, `[A]` and
+            `[]`); a full buffer overwrites its oldest one. Raises ValueError for wrong shapes and
+            TypeError for wrong dtypes.
+        sample: `(key, state, batch_size, recent=None) -> Transition`, leaves `[batch_size, ...]`,
+            drawn uniformly with replacement from all transitions or from the `recent` latest ones.
+            An empty buffer gives zeros. Raises ValueError if `batch_size` is negative or `recent`
+            is not positive.
         draw: `(key, batch_size) -> bits`, the randomness of `sample`, to draw ahead of time.
-        take: `(state, bits, recent=None) -> Transition`; `sample` is `take` of `draw`. TypeError if
-            the bits are not unsigned integers.
+        take: `(state, bits, recent=None) -> Transition`; `sample` is `take` of `draw`. Raises
+            TypeError if the bits are not unsigned integers.
         rows: `(state, bits, recent=None) -> index`, the rows of the storage that `take` reads.
-        at: `(state, index [...]) -> Transition`, leaves `[..., ...]`, what lies in these rows.
+        at: `(state, index [...]) -> Transition`, the transitions in these rows, leaves
+            `[..., ...]`.
     """
 
     init: Callable[[], ReplayState]
@@ -54,52 +64,81 @@ class Replay(NamedTuple):
 
 
 def make(spec: EnvSpec, capacity: int) -> Replay:
-    """A replay buffer of `capacity` transitions of `spec`'s sizes.
+    """Make a replay buffer of `capacity` transitions of `spec`'s sizes.
 
     Raises:
         ValueError: if `capacity` is not positive.
     """
     if capacity < 1:
         raise ValueError(f"replay capacity must be positive, got {capacity}")
+    rows = functools.partial(_rows, capacity)
+    at = functools.partial(_at, spec)
+    take = functools.partial(_take, at, rows)
+    return Replay(
+        init=functools.partial(_init, spec, capacity),
+        add=functools.partial(_add, spec, capacity),
+        sample=functools.partial(_sample, take),
+        draw=_draw,
+        take=take,
+        rows=rows,
+        at=at,
+    )
 
-    def init() -> ReplayState:
-        return ReplayState(jnp.zeros((capacity, row_size(spec))), jnp.zeros((), jnp.int32))
 
-    def add(state: ReplayState, transition: Transition) -> ReplayState:
-        checks.transition_shapes(spec, transition, (), "transition")
-        row = pack(spec, transition)
-        position = state.count % capacity
-        return ReplayState(state.storage.at[position].set(row), state.count + 1)
+def _init(spec: EnvSpec, capacity: int) -> ReplayState:
+    return ReplayState(jnp.zeros((capacity, row_size(spec))), jnp.zeros((), jnp.int32))
 
-    def draw(key: jax.Array, batch_size: int) -> jax.Array:
-        checks.counts(batch_size=batch_size)
-        return jax.random.bits(key, (batch_size,), jnp.uint32)
 
-    def rows(state: ReplayState, bits: jax.Array, recent: int | None = None) -> jax.Array:
-        checks.kind("bits", bits, jnp.unsignedinteger)
-        if recent is not None:
-            checks.sizes(recent=recent)
-        size = jnp.minimum(state.count, capacity if recent is None else min(recent, capacity))
-        # The bias of a remainder is below size / 2^32: nothing beside sampling noise.
-        age = (bits % jnp.maximum(size, 1).astype(jnp.uint32)).astype(jnp.int32)
-        return (state.count - 1 - age) % capacity
+def _add(spec: EnvSpec, capacity: int, state: ReplayState, transition: Transition) -> ReplayState:
+    checks.transition_shapes(spec, transition, (), "transition")
+    row = pack(spec, transition)
+    position = state.count % capacity
+    return ReplayState(state.storage.at[position].set(row), state.count + 1)
 
-    def at(state: ReplayState, index: jax.Array) -> Transition:
-        return unpack(spec, state.storage[index])
 
-    def take(state: ReplayState, bits: jax.Array, recent: int | None = None) -> Transition:
-        return at(state, rows(state, bits, recent))
+def _sample(
+    take: Callable[..., Transition],
+    key: jax.Array,
+    state: ReplayState,
+    batch_size: int,
+    recent: int | None = None,
+) -> Transition:
+    return take(state, _draw(key, batch_size), recent)
 
-    def sample(
-        key: jax.Array, state: ReplayState, batch_size: int, recent: int | None = None
-    ) -> Transition:
-        return take(state, draw(key, batch_size), recent)
 
-    return Replay(init, add, sample, draw, take, rows, at)
+def _draw(key: jax.Array, batch_size: int) -> jax.Array:
+    checks.counts(batch_size=batch_size)
+    return jax.random.bits(key, (batch_size,), jnp.uint32)
+
+
+def _take(
+    at: Callable[[ReplayState, jax.Array], Transition],
+    rows: Callable[..., jax.Array],
+    state: ReplayState,
+    bits: jax.Array,
+    recent: int | None = None,
+) -> Transition:
+    return at(state, rows(state, bits, recent))
+
+
+def _rows(
+    capacity: int, state: ReplayState, bits: jax.Array, recent: int | None = None
+) -> jax.Array:
+    checks.kind("bits", bits, jnp.unsignedinteger)
+    if recent is not None:
+        checks.sizes(recent=recent)
+    size = jnp.minimum(state.count, capacity if recent is None else min(recent, capacity))
+    # The remainder favours some rows by less than size / 2^32, far below sampling noise.
+    age = (bits % jnp.maximum(size, 1).astype(jnp.uint32)).astype(jnp.int32)
+    return (state.count - 1 - age) % capacity
+
+
+def _at(spec: EnvSpec, state: ReplayState, index: jax.Array) -> Transition:
+    return unpack(spec, state.storage[index])
 
 
 def row_size(spec: EnvSpec) -> int:
-    """`D`, the floats that one packed transition takes."""
+    """`D`, the number of floats in a packed transition."""
     return 2 * spec.observation_dim + spec.action_dim + 2
 
 
@@ -107,8 +146,8 @@ def pack(spec: EnvSpec, transition: Transition) -> jax.Array:
     """A transition's leaves as rows `[..., D]` float32.
 
     Raises:
-        ValueError: if a leaf is not of `spec`'s size.
-        TypeError: if it is not of floats, or `terminated` not bool.
+        ValueError: if a leaf does not have `spec`'s size.
+        TypeError: if a leaf is not of floats, or `terminated` is not bool.
     """
     checks.transition_shapes(spec, transition, jnp.shape(transition.reward), "transition")
     return jnp.concatenate(
@@ -127,8 +166,8 @@ def unpack(spec: EnvSpec, rows: jax.Array) -> Transition:
     """The transition in rows `[..., D]`: the inverse of `pack`.
 
     Raises:
-        ValueError: if the rows are not of `row_size` floats.
-        TypeError: if they are not floats.
+        ValueError: if a row does not have `row_size` entries.
+        TypeError: if the rows are not of floats.
     """
     checks.vectors("rows", rows, row_size(spec))
     o, a = spec.observation_dim, spec.action_dim

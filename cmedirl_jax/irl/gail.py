@@ -5,7 +5,8 @@ A comparator: Ho and Ermon 2016, off-policy as in Discriminator-Actor-Critic (Ko
 function of D.
 """
 
-from typing import Literal
+import functools
+from typing import Literal, NamedTuple
 
 import flax.struct
 import jax
@@ -24,11 +25,11 @@ class GAILHParams(flax.struct.PyTreeNode):
     """Hyperparameters. The numbers are traced leaves of the state.
 
     Attributes:
-        learning_rate: Adam's rate for the discriminator.
+        learning_rate: Adam's rate for the discriminator, per update.
         scale: Factor on the reward.
         output_penalty: Weight of the mean squared f(s, a) against the log-likelihood.
-        form: The reward: above zero, where living on pays; below zero, where ending does; or
-            either.
+        form: The reward as a function of D: -log(1 - D) is positive, so that longer episodes earn
+            more; log D is negative, so that shorter ones do; logit D can be either.
     """
 
     learning_rate: NotNegative = 1e-3
@@ -55,91 +56,128 @@ def make(
         optimizer: default Adam at `state.hparams.learning_rate`.
 
     Raises:
-        ValueError: if the specification does not agree with itself.
+        ValueError: if the specification contradicts itself.
     """
     checks.env_spec(spec)
-    hparams = hparams or GAILHParams()
-    network = network or rewards.mlp(spec)
-    tx = optax.with_extra_args_support(optimizer or optimizers.adam())
+    parts = _Parts(
+        spec=spec,
+        network=network or rewards.mlp(spec),
+        optimizer=optax.with_extra_args_support(optimizer or optimizers.adam()),
+    )
+    return RewardLearner(
+        init=functools.partial(_init, parts, hparams or GAILHParams()),
+        reward=functools.partial(_reward, parts),
+        update=functools.partial(_update, parts),
+    )
 
-    def init(key: jax.Array) -> RewardState:
-        params = network.init(key)
-        return RewardState(params, tx.init(params), traced(hparams))
 
-    def of_logit(logit: jax.Array, hparams: GAILHParams) -> jax.Array:
-        match hparams.form:
-            case "-log(1 - D)":
-                return hparams.scale * jax.nn.softplus(logit)
-            case "log D":
-                return hparams.scale * jax.nn.log_sigmoid(logit)
-            case "logit D":
-                return hparams.scale * logit
+class _Parts(NamedTuple):
+    """What the functions of one learner share. All static."""
 
-    def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
-        checks.pairs(spec, observation, action)
-        return of_logit(network.apply(state.params, observation, action), state.hparams)
+    spec: EnvSpec
+    network: Network
+    optimizer: optax.GradientTransformationExtraArgs
 
-    def update(
-        state: RewardState,
-        demonstrations: Transition | RewardBatch,
-        background: Transition | RewardBatch,
-        *,
-        key: jax.Array | None = None,
-    ) -> tuple[RewardState, RewardInfo]:
-        del key
-        demonstrated, sampled = (
-            base.pairs(spec, demonstrations, "demonstrations"),
-            base.pairs(spec, background, "background"),
-        )
-        split = demonstrated.mask.shape
 
-        def loss(params: Params):
-            observation, action = (
-                jnp.concatenate(
-                    [getattr(batch.transition, name) for batch in (demonstrated, sampled)]
-                )
-                for name in ("observation", "action")
-            )
-            logit = network.apply(params, observation, action)
-            on_demonstrations, on_background = jnp.split(logit, split)
-            value = log_likelihood(
-                (on_demonstrations, demonstrated.mask), (on_background, sampled.mask)
-            )
-            mask = jnp.concatenate([demonstrated.mask, sampled.mask])
-            penalty = regularisers.output_penalty(logit, mask)
-            penalised = -value + state.hparams.output_penalty * penalty
-            return penalised, (value, on_demonstrations, on_background)
+class _Evaluation(NamedTuple):
+    """Log-likelihood `[]`, and logits of the demonstrations `[D]` and of the background `[B]`."""
 
-        gradient, (value, on_demonstrations, on_background) = jax.grad(loss, has_aux=True)(
-            state.params
-        )
-        updates, optimizer_state = tx.update(
-            gradient, state.optimizer, state.params, learning_rate=state.hparams.learning_rate
-        )
-        r_d, r_b = (of_logit(logit, state.hparams) for logit in (on_demonstrations, on_background))
-        info = RewardInfo(
-            demonstration_reward=regularisers.masked_mean(r_d, demonstrated.mask),
-            background_reward=regularisers.masked_mean(r_b, sampled.mask),
-            log_likelihood=value,
-            log_prior=jnp.zeros(()),
-            gradient_norm=optax.tree.norm(gradient),
-            effective_sample_size=jnp.sum(sampled.mask).astype(value.dtype),
-        )
-        params = optax.apply_updates(state.params, updates)
-        return state.replace(params=params, optimizer=optimizer_state), info
+    log_likelihood: jax.Array
+    demonstrations: jax.Array
+    background: jax.Array
 
-    return RewardLearner(init, reward, update)
+
+def _init(parts: _Parts, hparams: GAILHParams, key: jax.Array) -> RewardState:
+    params = parts.network.init(key)
+    return RewardState(params, parts.optimizer.init(params), traced(hparams))
+
+
+def _reward(
+    parts: _Parts, state: RewardState, observation: jax.Array, action: jax.Array
+) -> jax.Array:
+    checks.pairs(parts.spec, observation, action)
+    return _of_logit(parts.network.apply(state.params, observation, action), state.hparams)
+
+
+def _of_logit(logit: jax.Array, hparams: GAILHParams) -> jax.Array:
+    """The reward of the discriminator's logit, `[...]` -> `[...]`."""
+    match hparams.form:
+        case "-log(1 - D)":
+            return hparams.scale * jax.nn.softplus(logit)
+        case "log D":
+            return hparams.scale * jax.nn.log_sigmoid(logit)
+        case "logit D":
+            return hparams.scale * logit
+
+
+def _update(
+    parts: _Parts,
+    state: RewardState,
+    demonstrations: Transition | RewardBatch,
+    background: Transition | RewardBatch,
+    *,
+    key: jax.Array | None = None,
+) -> tuple[RewardState, RewardInfo]:
+    del key
+    demonstrated = base.pairs(parts.spec, demonstrations, "demonstrations")
+    sampled = base.pairs(parts.spec, background, "background")
+
+    # Train the discriminator.
+    gradient, evaluation = jax.grad(_loss, has_aux=True)(
+        state.params, parts, state.hparams, demonstrated, sampled
+    )
+    updates, optimizer_state = parts.optimizer.update(
+        gradient, state.optimizer, state.params, learning_rate=state.hparams.learning_rate
+    )
+    params = optax.apply_updates(state.params, updates)
+
+    # Diagnostics, of the state before.
+    r_d = _of_logit(evaluation.demonstrations, state.hparams)
+    r_b = _of_logit(evaluation.background, state.hparams)
+    info = RewardInfo(
+        demonstration_reward=regularisers.masked_mean(r_d, demonstrated.mask),
+        background_reward=regularisers.masked_mean(r_b, sampled.mask),
+        log_likelihood=evaluation.log_likelihood,
+        log_prior=jnp.zeros(()),
+        gradient_norm=optax.tree.norm(gradient),
+        effective_sample_size=jnp.sum(sampled.mask).astype(evaluation.log_likelihood.dtype),
+    )
+    return state.replace(params=params, optimizer=optimizer_state), info
+
+
+def _loss(
+    params: Params,
+    parts: _Parts,
+    hparams: GAILHParams,
+    demonstrated: RewardBatch,
+    sampled: RewardBatch,
+) -> tuple[jax.Array, _Evaluation]:
+    """The discriminator's negative log-likelihood `[]`, with the penalty on its logit."""
+    # Both batches in one pass of the network.
+    pairs = [
+        (batch.transition.observation, batch.transition.action) for batch in (demonstrated, sampled)
+    ]
+    observation, action = map(jnp.concatenate, zip(*pairs, strict=True))
+    logit = parts.network.apply(params, observation, action)
+    on_demonstrations, on_background = jnp.split(logit, demonstrated.mask.shape)
+
+    value = log_likelihood((on_demonstrations, demonstrated.mask), (on_background, sampled.mask))
+    mask = jnp.concatenate([demonstrated.mask, sampled.mask])
+    loss = -value + hparams.output_penalty * regularisers.output_penalty(logit, mask)
+    return loss, _Evaluation(value, on_demonstrations, on_background)
 
 
 def log_likelihood(
     demonstrations: tuple[jax.Array, jax.Array], background: tuple[jax.Array, jax.Array]
 ) -> jax.Array:
-    """mean_D log D + mean_B log(1 - D), `[]` (Ho and Ermon 2016, Eq. 14, whose D is this 1 - D).
+    """mean_D log D + mean_B log(1 - D), `[]` (Ho and Ermon 2016, Eq. 14, with 1 - D as their D).
 
     Args:
         demonstrations: logits of D `[D]`, and their mask.
-        background: logits `[B]`, and their mask.
+        background: logits of D `[B]`, and their mask.
     """
     (on_demonstrations, mask), (on_background, background_mask) = demonstrations, background
-    told = regularisers.masked_mean(jax.nn.log_sigmoid(on_demonstrations), mask)
-    return told + regularisers.masked_mean(jax.nn.log_sigmoid(-on_background), background_mask)
+    of_demonstrations = regularisers.masked_mean(jax.nn.log_sigmoid(on_demonstrations), mask)
+    return of_demonstrations + regularisers.masked_mean(
+        jax.nn.log_sigmoid(-on_background), background_mask
+    )
