@@ -1,4 +1,4 @@
-"""Core types: what the parts of the library pass to each other. Shapes only, no behaviour."""
+"""Core types: what the parts of the library pass to each other. They have no behaviour."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,17 +17,17 @@ Numeric = jax.Array | float
 
 
 class EnvSpec(NamedTuple):
-    """What an algorithm needs to know of an environment. `O` and `A` name the two sizes.
+    """What an algorithm needs to know about an environment.
 
     Attributes:
         id: the environment's name, as Gymnasium writes it.
         observation_dim: `O`, the length of an observation vector.
         action_dim: `A`, the length of an action vector.
-        observation_low: `[O]` float32, lower bounds of the observations.
-        observation_high: `[O]` float32, upper bounds of the observations.
+        observation_low: `[O]` float32, lower bounds of the observations; may be infinite.
+        observation_high: `[O]` float32, upper bounds of the observations; may be infinite.
         action_low: `[A]` float32, lower bounds of the actions.
         action_high: `[A]` float32, upper bounds of the actions.
-        max_episode_steps: steps after which an episode is truncated.
+        max_episode_steps: environment steps after which an episode is truncated.
         reward_threshold: the mean return at which the task counts as solved.
     """
 
@@ -61,17 +61,46 @@ class Transition(NamedTuple):
     terminated: Any
 
 
-class RewardBatch(NamedTuple):
-    """What a reward is learned from: pairs, or whole trajectories, and how they were come by.
+class Demonstrations(NamedTuple):
+    """A pool of `N` demonstrated steps, episode after episode.
 
     Attributes:
-        transition: leaves `[B, ...]`, or `[M, T, ...]` for trajectories padded to T steps.
-        log_density: `[B]`, log b(a|s) of each action under the law that it was drawn from; or
-            `[M]`, log of each trajectory's density: the sum of those over its steps, or of a
-            mixture of such products. Zeros mean uniform weights, +inf leaves an entry out of the
-            samples.
-        mask: `[B]` or `[M, T]` bool, False past an episode's end. A trajectory that is False
-            throughout counts for nothing.
+        transition: leaves `[N, ...]`, the environment's own rewards among them.
+        truncated: `[N]` bool, the time limit cut the episode off at this step.
+        episode: `[N]` int32, the number of the step's episode: 0, 0, ..., 1, 1, ...
+        metadata: JSON values by name, among them `env`, the environment's name. It stays on the
+            host: pass `pool.transition` and a subset to jitted functions, not the pool.
+    """
+
+    transition: Transition
+    truncated: Array
+    episode: Array
+    metadata: dict[str, Any]
+
+
+class DemonstrationSubset(NamedTuple):
+    """Some episodes of a pool.
+
+    Attributes:
+        start: `[n]` int32, the pool's row in which each episode begins.
+        length: `[n]` int32, steps of each episode; 0 is padding.
+    """
+
+    start: Array
+    length: Array
+
+
+class RewardBatch(NamedTuple):
+    """What a reward is learned from: pairs or whole trajectories, with the densities they have.
+
+    Attributes:
+        transition: leaves `[B, ...]` for pairs, or `[M, T, ...]` for trajectories padded to T
+            steps.
+        log_density: for pairs `[B]`, log b(a|s) of each action under the law it was drawn from; for
+            trajectories `[M]`, the sum of that over the steps, or the log of a mixture of such
+            products. Zeros mean uniform weights; +inf leaves an entry out of the samples.
+        mask: `[B]` or `[M, T]` bool, False past an episode's end. A trajectory without any True is
+            left out.
     """
 
     transition: Transition

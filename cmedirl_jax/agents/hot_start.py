@@ -1,21 +1,26 @@
 """Hot start of actor and critic from demonstrations (the paper, section 3.4 and Eq. 11).
 
+    data = hot_start.data(pool, discount=0.99)
+    params = hot_start.fit(key, agent.networks, params, data)
+    state = agent.init(key, params)
+
 The actor is regressed on the demonstrated actions. The critic is a 'DAQN': its values at `cells`
-evenly spaced actions are pushed towards a target that singles out the demonstrated one. What the
-paper writes (a softmax over actions, a squared error to a one-hot array) fits no continuous critic
-as it stands; the readings, and two losses in its place, are the values of `HotStartHParams.critic`:
+evenly spaced actions per dimension are fitted to a target that singles out the demonstrated action.
+The paper's loss (a softmax over actions, a squared error to a one-hot array) is not defined for a
+continuous critic. `HotStartHParams.critic` chooses among three readings of it and two other losses:
 
 - "softmax" (H0, the letter): sum_k [softmax(Q(s, a_1..K))_k - 1{k = demonstrated cell}]^2
 - "one-hot" (H1): sum_k [Q(s, a_k) - 1{k = demonstrated cell}]^2, where the demonstrated action
   itself replaces the cell nearest to it
 - "quadratic" (H2): sum_k [Q(s, a_k) - (G(s) - curvature |a_k - a_demo|^2)]^2, with G the discounted
-  return that the demonstration went on to receive: values on the scale of returns
+  return of the rest of the demonstration, so that values are on the scale of returns
 - "monte-carlo" (H3): [Q(s, a_demo) - G(s)]^2, on the demonstrated action alone
 - "large-margin" (H4, as in DQfD, Hester et al. 2018): max_k [Q(s, a_k) + margin 1{k != demonstrated
-  cell}] - Q(s, a_demo), at the actions of "one-hot"; it leaves the level of Q free
+  cell}] - Q(s, a_demo), at the actions of "one-hot"; it does not fix the level of Q
 """
 
-from typing import Any, Literal, NamedTuple
+import functools
+from typing import Any, Literal
 
 import flax.struct
 import jax
@@ -26,23 +31,28 @@ import optax
 from cmedirl_jax import checks, grids
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.data import demonstrations as demonstrations_lib
-from cmedirl_jax.data.demonstrations import Demonstrations, DemonstrationSubset
+from cmedirl_jax.data.hot_start_data import HotStartData, prepare
 from cmedirl_jax.networks import ActorCritic
 from cmedirl_jax.ranges import NotNegative, Size
-from cmedirl_jax.types import Array, EnvSpec, Params, Transition
+from cmedirl_jax.types import Demonstrations, DemonstrationSubset, EnvSpec, Params
+
+data = prepare
+"""See `data.hot_start_data.prepare`."""
 
 
 class HotStartHParams(flax.struct.PyTreeNode):
-    """Hyperparameters; the strings and sizes are static.
+    """Hyperparameters. Strings and sizes are static.
 
     Attributes:
-        learning_rate: Adam's rate for both networks.
-        curvature: Of the "quadratic" critic target, per squared half-width of the action range.
-        margin: Of the "large-margin" loss: by how much the demonstrated action's value is to lead.
-        critic: The critic's loss: H0 to H4, see the module's docstring.
+        learning_rate: Adam's rate for both networks, per gradient step.
+        curvature: For the "quadratic" target: fall of the value per squared half-width of the
+            action range.
+        margin: For the "large-margin" loss: by how much the demonstrated action's value has to
+            exceed the others, in units of the value.
+        critic: The critic's loss, in the order H0 to H4 of `agents.hot_start`.
         cells: Evenly spaced values per action dimension, bounds included; K = cells^A actions.
         steps: Gradient steps on each network.
-        batch_size: Demonstrated steps per gradient step.
+        batch_size: Demonstrated environment steps per gradient step.
     """
 
     learning_rate: NotNegative = 1e-3
@@ -56,40 +66,6 @@ class HotStartHParams(flax.struct.PyTreeNode):
     batch_size: Size = flax.struct.field(pytree_node=False, default=32)
 
 
-class HotStartData(NamedTuple):
-    """A pool as the hot start reads it.
-
-    Attributes:
-        transition: leaves `[N, ...]`.
-        discounted_return: `[N]`, what each step went on to receive.
-        episodes: where the pool's episodes lie.
-    """
-
-    transition: Transition
-    discounted_return: Array
-    episodes: DemonstrationSubset
-
-
-def data(
-    demonstrations: Demonstrations, discount: float = 0.99, reward_scale: float = 1.0
-) -> HotStartData:
-    """Prepare a pool (on the host, once), for an agent of this discount and reward scale.
-
-    The returns are of the environment's reward and end with the demonstration, also where the time
-    limit cut it off.
-
-    Raises:
-        ValueError: if the discount is not between 0 and 1, or the scale not positive and finite.
-    """
-    checks.positive(reward_scale=reward_scale)
-    returns = demonstrations_lib.discounted_returns(demonstrations, discount)
-    return HotStartData(
-        demonstrations.transition,
-        (reward_scale * returns).astype(np.float32),
-        demonstrations_lib.episodes(demonstrations),
-    )
-
-
 def fit(
     key: jax.Array,
     networks: ActorCritic,
@@ -99,15 +75,15 @@ def fit(
     *,
     subset: DemonstrationSubset | None = None,
 ) -> tuple[Params, Params]:
-    """Fit actor and critic to demonstrations by supervised learning; optimisers are fresh.
+    """Fit actor and critic to demonstrations by supervised learning, with fresh optimisers.
 
-    Follow it with `agent.init(key, params)`, which copies the result to the targets.
+    Then call `agent.init(key, params)`, which copies the result to the targets.
 
     Args:
         key: randomness of the minibatches.
-        networks: whose parameters these are.
-        params: `(actor, critic)` to start from.
-        demonstrations: the pool; prepare it with `data` first under jit or vmap, or for an agent
+        networks: the actor and the critic.
+        params: their parameters `(actor, critic)` to start from.
+        demonstrations: the pool. Prepare it with `data` first under jit or vmap, or for an agent
             whose discount is not 0.99.
         hparams: hyperparameters.
         subset: the learner's own episodes of the pool; default all.
@@ -116,44 +92,60 @@ def fit(
         The fitted `(actor, critic)`.
 
     Raises:
-        ValueError: if the pool is not of the networks' sizes, or a size of `hparams` not positive.
-        TypeError: if a leaf of the pool is not of its dtype.
+        ValueError: if the pool does not fit the networks, or a size of `hparams` is not positive.
+        TypeError: if a leaf of the pool has a wrong dtype.
     """
     hparams = hparams or HotStartHParams()
     checks.sizes(cells=hparams.cells, steps=hparams.steps, batch_size=hparams.batch_size)
     if isinstance(demonstrations, Demonstrations):
-        demonstrations = data(demonstrations)
+        demonstrations = prepare(demonstrations)
     pool = jax.tree.map(jnp.asarray, demonstrations)
     chosen = pool.episodes if subset is None else subset
     size = pool.transition.observation.shape[:1]
     checks.transition_shapes(networks.spec, pool.transition, size, "demonstrations")
     checks.shape("discounted_return", pool.discounted_return, size)
     checks.shape("subset.length", chosen.length, jnp.shape(chosen.start)[:1])
+
     optimizer = optax.adam(hparams.learning_rate)
-
-    def loss(params: tuple[Params, Params], index: jax.Array):
-        actor, critic = params
-        observation = pool.transition.observation[index]
-        action = pool.transition.action[index]
-        actor_error, actor = networks_lib.imitation_error(networks, actor, observation, action)
-        critic_error, critic = critic_loss(
-            networks, critic, hparams, observation, action, pool.discounted_return[index]
-        )
-        # Disjoint parameters: the gradient of the sum is each network's own.
-        return actor_error + critic_error, (actor, critic)
-
-    def step(carry: tuple[Any, optax.OptState], key: jax.Array):
-        params, state = carry
-        index = demonstrations_lib.sample_index(key, chosen, hparams.batch_size)
-        grads, params = jax.grad(loss, has_aux=True)(params, index)
-        updates, state = optimizer.update(grads, state, params)
-        params: Any = optax.apply_updates(params, updates)
-        return (params, state), None
-
-    (fitted, _), _ = jax.lax.scan(
-        step, (params, optimizer.init(params)), jax.random.split(key, hparams.steps)
-    )
+    step = functools.partial(_step, networks, hparams, optimizer, pool, chosen)
+    keys = jax.random.split(key, hparams.steps)
+    (fitted, _), _ = jax.lax.scan(step, (params, optimizer.init(params)), keys)
     return fitted
+
+
+def _step(
+    networks: ActorCritic,
+    hparams: HotStartHParams,
+    optimizer: optax.GradientTransformation,
+    pool: HotStartData,
+    chosen: DemonstrationSubset,
+    carry: tuple[Any, optax.OptState],
+    key: jax.Array,
+) -> tuple[tuple[Any, optax.OptState], None]:
+    """Take a gradient step of both networks on a minibatch."""
+    params, state = carry
+    index = demonstrations_lib.sample_index(key, chosen, hparams.batch_size)
+    grads, params = jax.grad(_loss, has_aux=True)(params, networks, hparams, pool, index)
+    updates, state = optimizer.update(grads, state, params)
+    return (optax.apply_updates(params, updates), state), None
+
+
+def _loss(
+    params: tuple[Params, Params],
+    networks: ActorCritic,
+    hparams: HotStartHParams,
+    pool: HotStartData,
+    index: jax.Array,
+) -> tuple[jax.Array, tuple[Params, Params]]:
+    """The sum of both losses. They share no parameters, so each network gets its own gradient."""
+    actor, critic = params
+    observation = pool.transition.observation[index]
+    action = pool.transition.action[index]
+    actor_error, actor = networks_lib.imitation_error(networks, actor, observation, action)
+    critic_error, critic = critic_loss(
+        networks, critic, hparams, observation, action, pool.discounted_return[index]
+    )
+    return actor_error + critic_error, (actor, critic)
 
 
 def critic_loss(
@@ -164,7 +156,7 @@ def critic_loss(
     action: jax.Array,
     discounted_return: jax.Array,
 ) -> tuple[jax.Array, Params]:
-    """Eq. 11 as `hparams.critic` reads or replaces it, averaged over the batch, and the params.
+    """The loss `[]` that `hparams.critic` names (see above), and the parameters.
 
     Args:
         networks: whose critic.
@@ -172,18 +164,18 @@ def critic_loss(
         hparams: which loss, how many cells, the curvature, the margin.
         observation: `[B, O]`.
         action: `[B, A]`, demonstrated.
-        discounted_return: `[B]`, read by "quadratic" and "monte-carlo" alone.
+        discounted_return: `[B]`, G(s), which only "quadratic" and "monte-carlo" read.
     """
     evaluate = networks_lib.train_mode(networks.critic)
     if hparams.critic == "monte-carlo":
         q, critic = evaluate(critic, observation, action)
         return jnp.mean(jnp.square(q - discounted_return)), critic
+
+    # The cells' values [B, K], with the demonstrated action in its cell where the loss says so.
     spec = networks.spec
-    half_width = 0.5 * (spec.action_high - spec.action_low)
     cells = jnp.asarray(action_cells(spec, hparams.cells))
-    squared_distance = jnp.sum(
-        jnp.square((cells - action[:, None, :]) / half_width), axis=-1
-    )  # [B, K]
+    half_width = 0.5 * (spec.action_high - spec.action_low)
+    squared_distance = jnp.sum(jnp.square((cells - action[:, None, :]) / half_width), axis=-1)
     nearest = jax.nn.one_hot(jnp.argmin(squared_distance, axis=-1), len(cells))
     actions = jnp.broadcast_to(cells, (*squared_distance.shape, spec.action_dim))
     if hparams.critic in ("one-hot", "large-margin"):
@@ -192,6 +184,8 @@ def critic_loss(
         observation[:, None, :], (*squared_distance.shape, spec.observation_dim)
     )
     q, critic = evaluate(critic, observations, actions)
+
+    # The loss of each step [B].
     match hparams.critic:
         case "softmax":
             error = _squared_error(jax.nn.softmax(q, axis=-1), nearest)

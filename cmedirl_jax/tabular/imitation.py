@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
+from cmedirl_jax.data.hot_start_data import HotStartData
 from cmedirl_jax.envs import Env
 from cmedirl_jax.irl import rewards
 from cmedirl_jax.ranges import AtLeastTwo, BelowOne, NotNegative, Positive, Size

@@ -1,10 +1,11 @@
-"""A small pool of demonstrations by a scripted controller of known quality."""
+"""Small pools of demonstrations: by a scripted controller of known quality, and random ones."""
 
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hypothesis import strategies as st
 
 from cmedirl_jax import envs
 from cmedirl_jax.data.demonstrations import Demonstrations
@@ -39,3 +40,24 @@ def scripted(episodes=12, push=0.3):
     columns = [np.stack(column) for column in zip(*rows, strict=True)]
     metadata = {"env": ENV.spec.id}
     return Demonstrations(Transition(*columns[:5]), columns[5], columns[6], metadata)
+
+
+episode_lengths = st.lists(st.integers(1, 6), min_size=1, max_size=8)
+
+
+def random_pool(lengths, seed=0, last_unfinished=False):
+    """Episodes of the given lengths, every other one truncated, of random numbers."""
+    rng = np.random.default_rng(seed)
+    steps = sum(lengths)
+    episode = np.repeat(np.arange(len(lengths), dtype=np.int32), lengths)
+    last = np.r_[episode[1:] != episode[:-1], not last_unfinished]
+
+    def uniform(*shape):
+        return rng.uniform(-1, 1, (steps, *shape)).astype(np.float32)
+
+    return Demonstrations(
+        Transition(uniform(2), uniform(1), uniform(), uniform(2), last & (episode % 2 == 0)),
+        truncated=last & (episode % 2 == 1),
+        episode=episode,
+        metadata={"env": ENV.spec.id, "expert": "scripted", "seeds": [1, 2]},
+    )
