@@ -1,4 +1,4 @@
-"""Checks of shapes and dtypes while tracing, which cost nothing when the program runs."""
+"""Checks of arguments by name. They run while tracing and cost nothing in a compiled program."""
 
 import math
 from collections.abc import Mapping
@@ -20,10 +20,16 @@ _KINDS = {
 def transition_shapes(
     spec: EnvSpec, transition: Transition, leading: tuple[int, ...], name: str
 ) -> None:
-    """Check that every leaf has the axes `leading` and then `spec`'s, and its kind of dtype.
+    """Check the shapes and dtypes of a transition.
+
+    Args:
+        spec: gives the last axes.
+        transition: the transition.
+        leading: the axes in front of them.
+        name: of the argument, for the message.
 
     Raises:
-        ValueError: with the shapes expected and found.
+        ValueError: with the shapes expected and given.
         TypeError: naming the leaf and its dtype.
     """
     expected = {
@@ -33,9 +39,9 @@ def transition_shapes(
         "next_observation": (*leading, spec.observation_dim),
         "terminated": leading,
     }
-    found = {field: jnp.shape(leaf) for field, leaf in transition._asdict().items()}
-    if found != expected:
-        raise ValueError(f"{name}: expected leaves of shape {expected}, got {found}")
+    shapes = {field: jnp.shape(leaf) for field, leaf in transition._asdict().items()}
+    if shapes != expected:
+        raise ValueError(f"{name}: expected leaves of shape {expected}, got {shapes}")
     for field, leaf in transition._asdict().items():
         kind(f"{name}: {field}", leaf, jnp.bool_ if field == "terminated" else jnp.floating)
 
@@ -44,15 +50,15 @@ def pairs(spec: EnvSpec, observation: Any, action: Any = None) -> None:
     """Check observations `[..., O]` and, if given, actions `[..., A]`, of the same leading axes.
 
     Raises:
-        ValueError: with the shapes found.
+        ValueError: with the shapes given.
         TypeError: if they are not floats.
     """
-    found = {"observation": jnp.shape(observation)}
-    leading, expected = found["observation"][:-1], {"observation": spec.observation_dim}
+    shapes, dims = {"observation": jnp.shape(observation)}, {"observation": spec.observation_dim}
     if action is not None:
-        found["action"], expected["action"] = jnp.shape(action), spec.action_dim
-    if found != {name: (*leading, dim) for name, dim in expected.items()}:
-        raise ValueError(f"expected the same leading axes and then {expected}, got {found}")
+        shapes["action"], dims["action"] = jnp.shape(action), spec.action_dim
+    leading = shapes["observation"][:-1]
+    if shapes != {name: (*leading, dim) for name, dim in dims.items()}:
+        raise ValueError(f"expected the same leading axes and then {dims}, got {shapes}")
     kind("observation", observation, jnp.floating)
     if action is not None:
         kind("action", action, jnp.floating)
@@ -62,17 +68,17 @@ def shape(name: str, array: Any, expected: tuple[int, ...]) -> None:
     """Check a shape.
 
     Raises:
-        ValueError: with both shapes.
+        ValueError: with the shapes expected and given.
     """
     if jnp.shape(array) != expected:
         raise ValueError(f"{name}: expected shape {expected}, got {jnp.shape(array)}")
 
 
 def kind(name: str, array: Any, expected: Any) -> None:
-    """Check that a dtype is of a kind: `jnp.floating`, `integer`, `unsignedinteger` or `bool_`.
+    """Check a dtype's kind: `jnp.floating`, `jnp.integer`, `jnp.unsignedinteger` or `jnp.bool_`.
 
     Raises:
-        TypeError: naming the dtype.
+        TypeError: with the kind expected and the dtype given.
     """
     dtype = jnp.result_type(array)
     if not jnp.issubdtype(dtype, expected):
@@ -83,7 +89,7 @@ def vectors(name: str, array: Any, size: int) -> None:
     """Check vectors of floats, `[..., size]`, with any leading axes.
 
     Raises:
-        ValueError: with the shape expected and found.
+        ValueError: with the shapes expected and given.
         TypeError: if they are not floats.
     """
     shape(name, array, (*jnp.shape(array)[:-1], size))
@@ -101,7 +107,7 @@ def sizes(**named: int) -> None:
 
 
 def counts(**named: int) -> None:
-    """Check that static counts, of which there may be none, are integers that are not negative.
+    """Check that static counts are integers and not negative.
 
     Raises:
         ValueError: naming the first that is below 0.
@@ -119,7 +125,7 @@ def _at_least(low: int, named: Mapping[str, int]) -> None:
 
 
 def shares(**named: Numeric) -> None:
-    """Check that numbers are between 0 and 1. Arrays pass: their values may not be known.
+    """Check that numbers are between 0 and 1. Arrays pass, as their values may be unknown.
 
     Raises:
         ValueError: naming the first that is not.
@@ -130,7 +136,7 @@ def shares(**named: Numeric) -> None:
 
 
 def positive(**named: Numeric) -> None:
-    """Check that numbers are positive and finite. Arrays pass: their values may not be known.
+    """Check that numbers are positive and finite. Arrays pass, as their values may be unknown.
 
     Raises:
         ValueError: naming the first that is not.
@@ -141,14 +147,15 @@ def positive(**named: Numeric) -> None:
 
 
 def _known(number: Any) -> bool:
+    """Whether it is a number on the host, not an array that may be traced."""
     return isinstance(number, int | float | np.number)
 
 
 def env_spec(spec: EnvSpec) -> None:
-    """Check that a specification agrees with itself.
+    """Check that a specification does not contradict itself.
 
     Raises:
-        ValueError: naming the field and what it must be.
+        ValueError: naming the field and what it has to be.
         TypeError: naming a size that is a float.
     """
     sizes(

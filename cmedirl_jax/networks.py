@@ -1,12 +1,13 @@
 """Multi-layer perceptrons for the actor, the critic and the reward, as Linen modules.
 
-The paper states no architecture; the defaults here are the ones the `tuned` preset was chosen with:
-two hidden layers of 64 ReLU units, layer normalisation in the critic alone, observations scaled to
-[-1, 1]. Initialisation follows DDPG (Lillicrap et al. 2015, section 7): U(+-1/sqrt(fan_in)), and a
-small uniform range for the last layer.
+The paper states no architecture. The defaults are those of the `tuned` preset: two hidden layers
+of 64 ReLU units, layer normalisation in the critic only, observations scaled to [-1, 1].
+Initialisation follows DDPG (Lillicrap et al. 2015, section 7): U(+-1/sqrt(fan_in)), and a small
+uniform range for the last layer.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -28,9 +29,9 @@ class ActorCritic(NamedTuple):
     Attributes:
         actor: `apply(params, observation [..., O]) -> pre-activation [..., A]`, unbounded.
         critic: `apply(params, observation [..., O], action [..., A]) -> value [...]`.
-        squash: `(pre-activation [..., A]) -> action [..., A]`, onto the action bounds. The two
-            steps are apart because the pre-activation is what the saturation penalty acts on.
-        spec: the environment they are made for.
+        squash: `(pre-activation [..., A]) -> action [..., A]`, onto the action bounds. It is not
+            part of `actor`, because the saturation penalty acts on the pre-activation.
+        spec: the environment that they are made for.
     """
 
     actor: Network
@@ -44,13 +45,13 @@ class Architecture:
     """Sizes and switches of the actor and the critic. All static.
 
     Attributes:
-        hidden: Units of each hidden layer, for the actor and the critic alike.
-        actor_normalisation: Normalisation of the actor's hidden layers (before the ReLU).
-        critic_normalisation: Normalisation of the critic's hidden layers (before the ReLU).
+        hidden: Units of each hidden layer, of the actor and of the critic.
+        actor_normalisation: Normalisation of the actor's hidden layers, before each ReLU.
+        critic_normalisation: Normalisation of the critic's hidden layers, before each ReLU.
         normalise_observation: Map the observation bounds to [-1, 1] at the input of each network.
-        action_layer: Layer of the critic at which the action joins (0: the input; Lillicrap et al.:
-            1).
-        output_scale: Half-width of the uniform initialisation of the last layer.
+        action_layer: Index of the critic's layer at which the action joins (0: the input;
+            Lillicrap et al.: 1).
+        output_scale: Half-width of the uniform initialisation of the last layer's parameters.
     """
 
     hidden: tuple[Size, ...] = (64, 64)
@@ -68,7 +69,7 @@ class MLP(nn.Module):
         hidden: units of each hidden layer.
         output_dim: units of the last, linear layer.
         normalisation: of each hidden layer, before its ReLU.
-        join: index of the layer that also sees the second input; `len(hidden)` is the last one.
+        join: index of the layer at which the second input joins; `len(hidden)` is the last one.
         output_scale: half-width of the last layer's uniform initialisation.
     """
 
@@ -80,7 +81,13 @@ class MLP(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array, joined: jax.Array | None = None, train: bool = False):
-        """Return `[..., output_dim]` for `x` of `[..., D]` and `joined` of `[..., E]` or None."""
+        """Return `[..., output_dim]`.
+
+        Args:
+            x: `[..., D]`.
+            joined: the second input `[..., E]`, or None.
+            train: normalise batches by their own statistics and move the running ones.
+        """
         for index, units in enumerate(self.hidden):
             if joined is not None and index == self.join:
                 x = jnp.concatenate([x, joined], axis=-1)
@@ -157,11 +164,12 @@ def imitation_error(
     """Mean squared error of mu(s) to demonstrated actions, in training mode, and the parameters.
 
     Args:
-        networks: whose actor.
+        networks: the actor and the squashing.
         actor: its parameters.
         observation: `[B, O]`.
         action: `[B, A]`.
-        counts: `[B]` bool; the others add zeros to a mean that stays over all. None: all count.
+        counts: `[B]` bool; pairs that are False add zero to the mean, which stays a mean over all
+            pairs. None: all are True.
     """
     pre_activation, actor = train_mode(networks.actor)(actor, observation)
     squared = jnp.square(networks.squash(pre_activation) - action)
@@ -180,7 +188,7 @@ def squashing(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
 def observation_scaling(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
     """The affine map from `spec`'s observation bounds to [-1, 1]: `[..., O]` -> `[..., O]`.
 
-    It raises ValueError for another last axis, and TypeError for what is not floats.
+    The map raises ValueError for another last axis, and TypeError for arrays that are not floats.
 
     Raises:
         ValueError: if a bound is infinite.
@@ -192,49 +200,48 @@ def observation_scaling(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
         )
     centre = 0.5 * (spec.observation_high + spec.observation_low)
     half_width = 0.5 * (spec.observation_high - spec.observation_low)
+    return functools.partial(_scale, centre, half_width)
 
-    def scale(observation: jax.Array) -> jax.Array:
-        checks.vectors("observation", observation, spec.observation_dim)
-        return (observation - centre) / half_width
 
-    return scale
+def _scale(centre: np.ndarray, half_width: np.ndarray, observation: jax.Array) -> jax.Array:
+    checks.vectors("observation", observation, len(centre))
+    return (observation - centre) / half_width
 
 
 def from_module(apply: Callable[..., Any], init: Callable[[jax.Array], Params]) -> Network:
-    """Wrap a Linen `apply` (taking `train=` and `mutable=`) and `init` as a `Network`.
+    """Wrap a Linen `apply` (which takes `train=` and `mutable=`) and `init` as a `Network`.
 
-    The network gets a `train` function where its variables hold a `batch_stats` collection.
+    The network gets a `train` function if its variables have a `batch_stats` collection.
     """
     has_statistics = "batch_stats" in jax.eval_shape(init, jax.random.key(0))
-    if not has_statistics:
-        return Network(init, apply)
+    return Network(init, apply, functools.partial(_train, apply) if has_statistics else None)
 
-    def train(variables: Params, *inputs: jax.Array) -> tuple[jax.Array, Params]:
-        output, moved = apply(variables, *inputs, train=True, mutable=["batch_stats"])
-        return output, {**variables, **moved}
 
-    return Network(init, apply, train)
+def _train(
+    apply: Callable[..., Any], variables: Params, *inputs: jax.Array
+) -> tuple[jax.Array, Params]:
+    output, moved = apply(variables, *inputs, train=True, mutable=["batch_stats"])
+    return output, {**variables, **moved}
 
 
 def scalar_output(network: Network) -> Network:
-    """Drop the last axis, of size one, of a network's output."""
+    """Drop the last axis, of size one, from a network's output."""
+    return Network(
+        init=network.init,
+        apply=lambda params, *inputs: network.apply(params, *inputs)[..., 0],
+        train=None if network.train is None else functools.partial(_train_scalar, network.train),
+    )
 
-    def apply(params: Params, *inputs: jax.Array) -> jax.Array:
-        return network.apply(params, *inputs)[..., 0]
 
-    if network.train is None:
-        return Network(network.init, apply)
-    network_train = network.train
-
-    def train(params: Params, *inputs: jax.Array) -> tuple[jax.Array, Params]:
-        output, params = network_train(params, *inputs)
-        return output[..., 0], params
-
-    return Network(network.init, apply, train)
+def _train_scalar(
+    train: Callable[..., tuple[jax.Array, Params]], params: Params, *inputs: jax.Array
+) -> tuple[jax.Array, Params]:
+    output, params = train(params, *inputs)
+    return output[..., 0], params
 
 
 def train_mode(network: Network) -> Callable[..., tuple[jax.Array, Params]]:
-    """`network.train`, or for a network without statistics its `apply` and unchanged parameters."""
+    """`network.train`; without running statistics, `apply` and the parameters as they are."""
     if network.train is not None:
         return network.train
     return lambda params, *inputs: (network.apply(params, *inputs), params)

@@ -24,10 +24,10 @@ class Range(NamedTuple):
     """A closed interval. NaN lies outside.
 
     Attributes:
-        low: the least value.
+        low: the smallest value.
         high: the largest value.
-        words: what a value must be, after "must be".
-        too_large: what a value above `high` must be, if that says it better than `words`.
+        words: what a value must be, as it follows "must be" in a message.
+        too_large: the same for a value above `high`, where another wording is clearer.
     """
 
     low: float
@@ -36,7 +36,7 @@ class Range(NamedTuple):
     too_large: str | None = None
 
 
-# The library counts in 32 bits and computes in 32-bit floats, whose infinity begins at 3.4e38.
+# The library counts in int32 and computes in float32.
 _LARGEST = 2**31 - 1
 _COUNT = Range(0, _LARGEST, "at least 0", "at most 2^31 - 1")
 POSITIVE = Range(float(_FLOAT.tiny), float(_FLOAT.max), "positive and finite")
@@ -53,13 +53,13 @@ BelowOne = Annotated[float, Range(0.0, 1.0 - float(_FLOAT.epsneg), "at least 0 a
 
 
 def check(settings: Any) -> None:
-    """Refuse numbers out of their range. Traced numbers and arrays pass: their values are unknown.
+    """Refuse numbers out of their range. Arrays pass, as their values may be unknown.
 
     Args:
-        settings: a dataclass, of which every number and every nested dataclass is checked.
+        settings: a dataclass; its numbers and nested dataclasses are checked.
 
     Raises:
-        ValueError: naming the first such number, what it must be and what it is.
+        ValueError: naming the first number that is out of range, what it must be and what it is.
         TypeError: for a number whose field has no range.
     """
     for name, wrong in out_of_range(settings):
@@ -67,7 +67,7 @@ def check(settings: Any) -> None:
 
 
 def out_of_range(settings: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """The dotted name of each number of a dataclass that is out of its range, and what is wrong.
+    """Yield the dotted name of each number that is out of its range, and what is wrong with it.
 
     Raises:
         TypeError: for a number whose field has no range.
@@ -77,7 +77,7 @@ def out_of_range(settings: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
         if dataclasses.is_dataclass(value):
             yield from out_of_range(value, f"{name}.")
             continue
-        # Of a tuple, each of its numbers.
+        # In a tuple, each number is checked.
         for number in value if isinstance(value, tuple) else (value,):
             if not isinstance(number, int | float | np.number) or isinstance(number, bool):
                 continue
@@ -98,13 +98,15 @@ def of_fields(settings: type) -> dict[str, Range | None]:
     """The range of each field of a dataclass; None where its annotation has none."""
     hints = typing.get_type_hints(settings, include_extras=True)
     return {
-        field.name: next(_found(hints[field.name]), None) for field in dataclasses.fields(settings)
+        field.name: next(_ranges_in(hints[field.name]), None)
+        for field in dataclasses.fields(settings)
     }
 
 
-def _found(annotation: Any) -> Iterator[Range]:
+def _ranges_in(annotation: Any) -> Iterator[Range]:
+    """The ranges in an annotation and its parts: `Size | None` and `tuple[Size, ...]` have one."""
     for extra in getattr(annotation, "__metadata__", ()):
         if isinstance(extra, Range):
             yield extra
     for part in typing.get_args(annotation):
-        yield from _found(part)
+        yield from _ranges_in(part)

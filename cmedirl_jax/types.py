@@ -13,7 +13,7 @@ Array = jax.Array | np.ndarray
 """An array on the device or on the host."""
 
 Numeric = jax.Array | float
-"""A scalar that may be traced: a Python number or an array of shape `[]`."""
+"""A scalar that may be traced: a Python number, or an array of shape `[]`."""
 
 
 class EnvSpec(NamedTuple):

@@ -1,12 +1,12 @@
-"""Densities of behaviour laws, by which sampled actions estimate Z = integral of exp r.
+"""Densities of behaviour policies, by which sampled actions estimate Z = integral of exp r.
 
-An action `a` drawn from a law of density b estimates Z without bias by z exp r(a), z = 1 / b, if b
-is with respect to the measure that Z integrates over and nowhere zero. Here that is the base
-measure: in each dimension the Lebesgue measure inside the action bounds and a unit mass at each
-bound, where clipping puts an atom. A law with an atom elsewhere has density infinity there: z = 0.
-A law without mass at the bounds estimates the integral over the inside alone.
+An action `a` drawn from a law of density b gives the unbiased estimate z exp r(a) of Z, z = 1 / b.
+This requires that b is nowhere zero and is a density with respect to the measure of the integral.
+That base measure is, in each dimension, the Lebesgue measure inside the action bounds and a unit
+mass at each bound, where clipping puts an atom. Where a law has an atom elsewhere its density is
+infinite, so z = 0. A law without mass at the bounds estimates the integral over the inside alone.
 
-Densities are logarithms; a density is zero at -inf. Shapes: observations `[..., O]`, actions
+All functions return logarithms; -inf is a density of zero. Shapes: observations `[..., O]`, actions
 `[..., A]`, densities `[...]`.
 """
 
@@ -24,10 +24,10 @@ SCALE_FLOOR = 1e-2
 
 
 class ConditionalGaussian(NamedTuple):
-    """N((1, s) coefficients, diag(scale^2)).
+    """The law N((1, s) coefficients, diag(scale^2)) of an action.
 
     Attributes:
-        coefficients: `[O + 1, A]`, the intercept first.
+        coefficients: `[O + 1, A]`, with the intercept first.
         scale: `[A]`, standard deviations, in units of the action.
     """
 
@@ -36,7 +36,7 @@ class ConditionalGaussian(NamedTuple):
 
 
 def clipped_normal(spec: EnvSpec, mean: Array, scale: Array, action: Array) -> jax.Array:
-    """Log density of clip(N(mean, diag(scale^2))): the tails' masses at the bounds.
+    """Log density of clip(N(mean, diag(scale^2))); each bound has the mass of the tail beyond it.
 
     Args:
         spec: the action bounds.
@@ -59,18 +59,19 @@ def epsilon_greedy(
     action: Array,
     noise: Array | None = None,
 ) -> jax.Array:
-    """Log density of: uniform inside the bounds with probability epsilon, greedy otherwise.
+    """Log density of a uniform action with probability epsilon, else of the greedy one.
 
-    Without noise it is log(epsilon / volume), and inf at the atom, where `action` equals `greedy`
-    in every bit: mu(s) computed in another program may round otherwise, a recorded density cannot.
+    Without noise it is log(epsilon / volume), and inf at the atom. The atom is where `action` and
+    `greedy` are equal in every bit, so compute the density in the program that computes mu(s):
+    another one may round differently.
 
     Args:
         spec: the action bounds.
         epsilon: probability of a uniform action, `[...]`.
         greedy: `[..., A]`.
         action: `[..., A]`.
-        noise: standard deviations of Gaussian noise on the greedy action, clipped, `[..., A]` in
-            units of the action; None for none.
+        noise: standard deviations of clipped Gaussian noise on the greedy action, `[..., A]`, in
+            units of the action; None: no noise.
     """
     uniform = jnp.log(epsilon) - log_volume(spec)
     if noise is None:
@@ -83,16 +84,19 @@ def epsilon_greedy(
 
 
 def log_volume(spec: EnvSpec) -> np.floating:
-    """Logarithm of the volume inside the action bounds: minus a uniform action's log density."""
+    """Log of the volume inside the action bounds; a uniform action's log density is minus that."""
     return np.sum(np.log(spec.action_high - spec.action_low))
 
 
 def transition_mixture(log_densities: jax.Array, filled: jax.Array | None = None) -> jax.Array:
-    """Log density of actions of `K` policies mixed step by step, log mean_k q_k(a|s): `[...]`.
+    """Log density of an action when each step draws one of `K` policies: log mean_k q_k(a|s).
 
     Args:
-        log_densities: log q_k(a|s), `[K, ...]`; inf in one makes the mixture's inf.
-        filled: which components there are, `[K]` bool, at least one; default all.
+        log_densities: log q_k(a|s), `[K, ...]`; an inf makes the result inf.
+        filled: `[K]` bool, which policies are in the mixture, at least one; default all.
+
+    Returns:
+        `[...]`.
     """
     if filled is not None:
         filled = filled.reshape(-1, *[1] * (log_densities.ndim - 1))
@@ -102,18 +106,21 @@ def transition_mixture(log_densities: jax.Array, filled: jax.Array | None = None
 def trajectory_mixture(
     log_densities: jax.Array, steps: jax.Array, filled: jax.Array | None = None
 ) -> jax.Array:
-    """Log density of the actions of whole trajectories, each of one of `K` policies: `[...]`.
+    """Log density of trajectories when each trajectory draws one of `K` policies.
 
-    log mean_k exp(sum_t log q_k(a_t|s_t)); the mean at each step would be of trajectories whose
-    policy changes from step to step.
+    It is log mean_k exp(sum_t log q_k(a_t|s_t)). The mean at each step would be right for
+    trajectories whose policy changes from step to step.
 
     Args:
         log_densities: log q_k(a_t|s_t), `[K, ..., T]`.
-        steps: which of them are steps of the trajectory, `[..., T]` bool; the others count nothing.
-        filled: which components there are, `[K]` bool, at least one; default all.
+        steps: `[..., T]` bool, which entries are steps of the trajectory; the others are ignored.
+        filled: `[K]` bool, which policies are in the mixture, at least one; default all.
+
+    Returns:
+        `[...]`.
     """
     taken = jnp.where(steps, log_densities, 0.0)
-    # An action that a policy never takes outweighs any atom among the others: not inf - inf.
+    # A policy that never takes one of the actions has density 0, whatever atoms the others have.
     impossible = jnp.any(taken == -jnp.inf, axis=-1)
     total = jnp.sum(jnp.where(impossible[..., None], 0.0, taken), axis=-1)
     return transition_mixture(jnp.where(impossible, -jnp.inf, total), filled)
@@ -122,26 +129,27 @@ def trajectory_mixture(
 def fit_gaussian(
     spec: EnvSpec, observation: Array, action: Array, weight: Array | None = None
 ) -> ConditionalGaussian:
-    """The Gaussian, affine in the observation, of demonstrated actions: an approximation of b(a|s).
+    """Fit a Gaussian, affine in the observation, to demonstrated actions: it approximates b(a|s).
 
-    Least squares of the action on (1, s); the scale is the residuals' root mean square, or
-    `SCALE_FLOOR`. A bound that was demonstrated counts as the value it is, not as a clipped one.
+    The mean is the least-squares fit of the action to (1, s). The scale is the residuals' root mean
+    square, at least `SCALE_FLOOR`. A demonstrated action on a bound is fitted as that value, not as
+    a clipped one.
 
     Args:
         spec: the action bounds.
         observation: `[N, O]`.
         action: `[N, A]`.
-        weight: of each pair, `[N]`, not all zero; default equal.
+        weight: `[N]`, of each pair, not all zero; default equal.
     """
     weight = jnp.ones(len(observation)) if weight is None else weight
     mean, action_mean = (jnp.average(x, 0, weight) for x in (observation, action))
     spread = jnp.sqrt(jnp.average(jnp.square(observation - mean), 0, weight))
-    # Of what does not vary there is only the mean's rounding, which is not to be scaled up.
+    # Constant features carry only rounding error: do not rescale them.
     spread = jnp.where(spread > 1e-6 * jnp.abs(mean), spread, jnp.inf)
     standard = (observation - mean) / spread
     share = (weight / jnp.sum(weight))[:, None]
-    # Conjugate gradients end after O steps, and stay at zero where nothing varies. A factorisation
-    # by LAPACK, dispatched ahead to several CPU devices, can wait for Python's lock for ever.
+    # Conjugate gradients end after O steps, and give zero for constant features. LAPACK's
+    # factorisations can deadlock on Python's lock when dispatched to several CPU devices.
     slopes, _ = jax.scipy.sparse.linalg.cg(
         lambda slopes: standard.T @ (share * (standard @ slopes)),
         standard.T @ (share * (action - action_mean)),
@@ -160,9 +168,15 @@ def fit_gaussian(
 def gaussian_policy(
     spec: EnvSpec, fitted: ConditionalGaussian, observation: Array, action: Array
 ) -> jax.Array:
-    """Log density `[...]` of the fitted Gaussian, clipped: `[..., O]`, `[..., A]`.
+    """Log density `[...]` of the fitted Gaussian, clipped to the bounds.
 
-    It stands in for the demonstrators' unknown law; its estimates of Z are as good as it is.
+    It stands in for the demonstrators' unknown law, so estimates of Z made with it are approximate.
+
+    Args:
+        spec: the action bounds.
+        fitted: what `fit_gaussian` gave.
+        observation: `[..., O]`.
+        action: `[..., A]`.
     """
     mean = fitted.coefficients[0] + observation @ fitted.coefficients[1:]
     return clipped_normal(spec, mean, fitted.scale, action)

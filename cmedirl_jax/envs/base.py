@@ -17,7 +17,7 @@ class Step(NamedTuple):
         observation: `[O]` float32, of the new state; never that of a reset.
         reward: `[]` float32.
         terminated: `[]` bool, the task ended (no bootstrapping).
-        truncated: `[]` bool, the time limit was reached (bootstrapping goes on). Both may be set.
+        truncated: `[]` bool, the time limit was reached (values still bootstrap). Both may be True.
     """
 
     observation: jax.Array
@@ -48,14 +48,14 @@ class Env(NamedTuple):
     """An environment: `env.step(key, state, action, params)`, vmappable over every argument.
 
     Attributes:
-        spec: static facts.
-        default_params: physics and limits as a pytree of traced leaves.
+        spec: the sizes and bounds. Static.
+        default_params: physics and limits, as a pytree of traced leaves.
         reset: see `ResetFn`.
         step: see `StepFn`.
         starts: `(count, params) -> (states [count], observations [count, O])`, fixed start states
-            evenly spread over the start distribution, for evaluation.
-        state_at: `(observation [O], params) -> state` at the start of its clock, where an
-            observation says all about the state; else None.
+            for evaluation, evenly spread over the start distribution.
+        state_at: `(observation [O], params) -> state`, the state with that observation, at step 0
+            of an episode; None if an observation does not determine the state.
     """
 
     spec: EnvSpec
@@ -67,15 +67,15 @@ class Env(NamedTuple):
 
 
 def check(env: Env, params: Any = None) -> None:
-    """Check an environment's specification, and that its functions keep to it. Nothing is run.
+    """Check an environment's specification, and by tracing that its functions keep to it.
 
     Args:
         env: the environment.
         params: its parameters, default `env.default_params`.
 
     Raises:
-        ValueError: naming what has another shape, or another structure.
-        TypeError: naming what has another dtype.
+        ValueError: naming what has a wrong shape or structure.
+        TypeError: naming what has a wrong dtype.
     """
     spec = env.spec
     checks.env_spec(spec)
@@ -83,36 +83,40 @@ def check(env: Env, params: Any = None) -> None:
     key = jax.eval_shape(lambda: jax.random.key(0))
     action = jax.ShapeDtypeStruct((spec.action_dim,), jnp.float32)
 
-    def same(name: str, found: Any, expected: Any) -> None:
-        leaves = [[(x.shape, x.dtype) for x in jax.tree.leaves(tree)] for tree in (found, expected)]
-        if leaves[0] != leaves[1] or jax.tree.structure(found) != jax.tree.structure(expected):
-            raise ValueError(f"{spec.id}: {name} is not of reset's kind: {found}, not {expected}")
-
-    def observations(name: str, found: Any, *leading: int) -> None:
-        name = f"{spec.id}: observation of {name}"
-        checks.shape(name, found, (*leading, spec.observation_dim))
-        checks.kind(name, found, jnp.floating)
-
+    # An episode's first state and a step from it.
     state, observation = jax.eval_shape(lambda key: env.reset(key, params), key)
-    observations("reset", observation)
+    _check_observation(spec, "reset", observation)
     after, step = jax.eval_shape(
         lambda key, state, action: env.step(key, state, action, params), key, state, action
     )
-    same("state after a step", after, state)
-    observations("step", step.observation)
-    for name, kind in (
-        ("reward", jnp.floating),
-        ("terminated", jnp.bool_),
-        ("truncated", jnp.bool_),
-    ):
+    _check_state(spec, "state after a step", after, state)
+    _check_observation(spec, "step", step.observation)
+    kinds = {"reward": jnp.floating, "terminated": jnp.bool_, "truncated": jnp.bool_}
+    for name, kind in kinds.items():
         checks.shape(f"{spec.id}: {name}", getattr(step, name), ())
         checks.kind(f"{spec.id}: {name}", getattr(step, name), kind)
+
+    # The fixed starts, and states of given observations.
     count = 2
-    states, start_observations = jax.eval_shape(lambda: env.starts(count, params))
-    observations("starts", start_observations, count)
+    states, observations = jax.eval_shape(lambda: env.starts(count, params))
+    _check_observation(spec, "starts", observations, count)
     first = jax.eval_shape(lambda states: jax.tree.map(lambda leaf: leaf[0], states), states)
-    same("a state of starts", first, state)
+    _check_state(spec, "a state of starts", first, state)
     if env.state_at is not None:
         state_at = env.state_at
         of_observation = jax.eval_shape(lambda seen: state_at(seen, params), observation)
-        same("state_at", of_observation, state)
+        _check_state(spec, "state_at", of_observation, state)
+
+
+def _check_state(spec: EnvSpec, name: str, state: Any, expected: Any) -> None:
+    leaves, wanted = (
+        [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)] for tree in (state, expected)
+    )
+    if leaves != wanted or jax.tree.structure(state) != jax.tree.structure(expected):
+        raise ValueError(f"{spec.id}: {name} is not of reset's kind: {state}, not {expected}")
+
+
+def _check_observation(spec: EnvSpec, name: str, observation: Any, *leading: int) -> None:
+    name = f"{spec.id}: observation of {name}"
+    checks.shape(name, observation, (*leading, spec.observation_dim))
+    checks.kind(name, observation, jnp.floating)

@@ -1,4 +1,4 @@
-"""MountainCarContinuous-v0 in pure JAX, step for step Gymnasium's.
+"""MountainCarContinuous-v0 in pure JAX, equal to Gymnasium's step by step.
 
 Source: Gymnasium 1.4.0, `gymnasium/envs/classic_control/continuous_mountain_car.py`. Two details
 that other ports miss: the *force* uses the clipped action while the *cost* uses the action as
@@ -16,7 +16,22 @@ from cmedirl_jax.types import EnvSpec, Numeric
 
 
 class MountainCarParams(flax.struct.PyTreeNode):
-    """Physics, as traced leaves. Positions and velocities are in the units of Gymnasium's car."""
+    """Physics, as traced leaves, in Gymnasium's units of position; velocities are per step.
+
+    Attributes:
+        power: velocity that a step of full force adds.
+        gravity: largest velocity that a step on the slope adds.
+        max_speed: largest magnitude of the velocity.
+        min_position: the left wall, where the car stops.
+        max_position: the right end.
+        goal_position: least position of the goal.
+        goal_velocity: least velocity at the goal.
+        goal_reward: reward of reaching the goal.
+        action_cost: cost of a step per squared action.
+        start_low: least start position.
+        start_high: largest start position.
+        max_episode_steps: steps after which an episode is truncated.
+    """
 
     power: Numeric = 0.0015
     gravity: Numeric = 0.0025
@@ -33,7 +48,13 @@ class MountainCarParams(flax.struct.PyTreeNode):
 
 
 class MountainCarState(flax.struct.PyTreeNode):
-    """The car. `time` counts the steps of the episode so far."""
+    """The car.
+
+    Attributes:
+        position: `[]` float32.
+        velocity: `[]` float32, change of the position per step.
+        time: `[]` int32, steps of the episode so far.
+    """
 
     position: jax.Array
     velocity: jax.Array
@@ -54,7 +75,7 @@ SPEC = EnvSpec(
 
 
 def make() -> Env:
-    """The environment with Gymnasium's physics as default parameters."""
+    """Make the environment; Gymnasium's physics are its default parameters."""
     return Env(SPEC, MountainCarParams(), reset, step, starts, state_at)
 
 
@@ -72,7 +93,7 @@ def starts(count: int, params: MountainCarParams) -> tuple[MountainCarState, jax
 def step(
     key: jax.Array, state: MountainCarState, action: jax.Array, params: MountainCarParams
 ) -> tuple[MountainCarState, Step]:
-    """Advance the car; deterministic, so `key` goes unused. `action` is `[1]`."""
+    """Advance the car by `action` `[1]`. It is deterministic and does not use `key`."""
     del key
     force = jnp.clip(action[0], SPEC.action_low[0], SPEC.action_high[0])
     velocity = state.velocity + (

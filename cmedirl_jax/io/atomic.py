@@ -1,4 +1,4 @@
-"""Names on disk that a power cut finds with all of their content, or not at all."""
+"""Files and folders that appear on disk whole: a power cut leaves all of one, or nothing."""
 
 import errno
 import os
@@ -6,10 +6,10 @@ from pathlib import Path
 
 
 def replace(partial: Path, path: Path) -> None:
-    """Flush the file or folder `partial` to the disk and move it to `path`, for good.
+    """Flush the file or folder `partial` to the disk, and move it to `path`.
 
     Raises:
-        OSError: if either cannot be done.
+        OSError: if it cannot be flushed or moved.
     """
     flush(partial)
     os.replace(partial, path)
@@ -17,7 +17,11 @@ def replace(partial: Path, path: Path) -> None:
 
 
 def flush(path: Path) -> None:
-    """Flush a file, or a folder with all that is below it."""
+    """Flush a file, or a folder and everything in it.
+
+    Raises:
+        OSError: if something in it cannot be read or flushed.
+    """
 
     def refuse(error: OSError) -> None:
         raise error
@@ -32,7 +36,7 @@ def flush(path: Path) -> None:
 
 
 def flush_name(path: Path) -> None:
-    """Flush the name of a file or folder, which is what the folder around it holds."""
+    """Flush the name of a file or folder, which is stored in its parent folder."""
     _flush_one(path.parent)
 
 
@@ -41,7 +45,7 @@ def _flush_one(path: Path) -> None:
     try:
         os.fsync(descriptor)
     except OSError as error:
-        # Some file systems flush no folders.
+        # Some file systems cannot flush folders.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP):
             raise
     finally:

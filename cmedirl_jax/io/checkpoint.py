@@ -15,31 +15,31 @@ from orbax.checkpoint import v1 as orbax
 from cmedirl_jax.io import atomic
 
 _OVERHEAD = 2**20
-"""Bytes that a checkpoint may take beside its arrays."""
+"""Bytes that a checkpoint may take in addition to its arrays."""
 _MARK = "_CHECKPOINT_METADATA"
-"""A file that every finished orbax checkpoint has."""
+"""A file in every finished orbax checkpoint."""
 
 
 def save(path: str | Path, tree: Any) -> None:
-    """Write a pytree of arrays to the folder `path`; a whole one or none.
+    """Write a pytree of arrays to the folder `path`, completely or not at all.
 
-    Under `jax.distributed`, orbax's way: every process calls it, and all wait for each other.
+    Under `jax.distributed` every process has to call it: orbax makes them wait for each other.
 
     Args:
-        path: the folder; a checkpoint that is there is replaced.
+        path: the folder. A checkpoint that is there is replaced.
         tree: arrays, none of them empty.
 
     Raises:
-        FileExistsError: if there is something at `path` that is not a checkpoint, to be replaced.
-        OSError: if the folder cannot be written, or its disk has no room for the arrays.
-        ValueError: if the tree is not such a one.
+        FileExistsError: if something that is not a checkpoint exists at `path`.
+        OSError: if the folder cannot be written, or the disk has no room for the arrays.
+        ValueError: if the tree has other leaves than that.
     """
     path = os.path.abspath(path)
     if os.path.exists(path) and not _is_checkpoint(path):
         raise FileExistsError(f"{path}: exists and is not a checkpoint")
     parent = os.path.dirname(path)
     os.makedirs(parent, exist_ok=True)
-    # Before orbax begins: where it runs out of room it leaves its traces and its complaints.
+    # Checked first, because orbax leaves partial files behind when the disk is full.
     needed = sum(leaf.nbytes for leaf in jax.tree.leaves(tree)) + _OVERHEAD
     if shutil.disk_usage(parent).free < needed:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
@@ -55,13 +55,13 @@ def load(path: str | Path, like: Any = None) -> Any:
 
     Args:
         path: the folder.
-        like: a pytree of the same structure (of arrays, or as `jax.eval_shape` gives it), whose
-            container types, dtypes and shapes the result takes on. Without it NamedTuples and
-            dataclasses come back as dicts, tuples as lists.
+        like: a pytree of the same structure, of arrays or as `jax.eval_shape` gives it. The result
+            has its container types, dtypes and shapes. Without it NamedTuples and dataclasses are
+            returned as dicts, and tuples as lists.
 
     Raises:
         FileNotFoundError: if there is no checkpoint at `path`.
-        OSError: if it cannot be read.
+        OSError: if the checkpoint cannot be read.
         ValueError: if its structure differs from `like`'s.
     """
     path = os.path.abspath(path)
@@ -74,7 +74,7 @@ def load(path: str | Path, like: Any = None) -> Any:
 
 
 def _load(path: str, like: Any) -> Any:
-    # Orbax passes over a None that stands where the other tree has an array.
+    # Orbax does not complain if one tree has None where the other has an array.
     held = len(jax.tree.leaves(orbax.metadata(path).metadata))
     if held != len(jax.tree.leaves(like)):
         raise ValueError(f"{path}: holds {held} arrays, not {len(jax.tree.leaves(like))}")
@@ -90,7 +90,7 @@ def _load(path: str, like: Any) -> Any:
 
 @contextlib.contextmanager
 def _os_errors(path: str) -> Iterator[None]:
-    """Make OSErrors of those that tensorstore wraps into ValueErrors."""
+    """Raise OSError where tensorstore wraps one into a ValueError."""
     try:
         yield
     except ValueError as error:

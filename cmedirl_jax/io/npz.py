@@ -1,4 +1,4 @@
-"""Reading npz files that are not to be trusted: no pickle, no memory for what is not there."""
+"""Reading npz files from untrusted sources: no pickle, no memory for data that is not there."""
 
 import math
 import zipfile
@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 
 _DEFLATE_RATIO = 1032
-"""No deflate stream is longer unpacked than so many times its length."""
+"""Deflate never shrinks data by more than this factor."""
 
 
 def read(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """The arrays `names` of a file, none of them read before all have been found to lie in it.
+    """Read the arrays `names` of a file, once the sizes of all of them have been checked.
 
     Raises:
         ValueError: if an array holds pickled objects, is compressed by a method that numpy does not
             write, or claims more bytes than the file can hold.
-        Exception: whatever zipfile, zlib or numpy raise for a damaged file.
+        Exception: what zipfile, zlib or numpy raise for a damaged file.
     """
     with zipfile.ZipFile(path) as archive:
         for name in names:
@@ -26,7 +26,7 @@ def read(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def _check_size(archive: zipfile.ZipFile, name: str, length: int) -> None:
-    """Refuse an array that claims more bytes than a file of this length can hold, unread."""
+    """Refuse an array whose header claims more bytes than a file of `length` bytes can hold."""
     entry = archive.getinfo(name)
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name} is compressed by another method")

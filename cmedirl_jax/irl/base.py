@@ -1,4 +1,4 @@
-"""What learners of rewards have in common: their state, their diagnostics, their interface."""
+"""The interface of reward learners: their state, their diagnostics, their functions."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
@@ -18,10 +18,10 @@ class RewardInfo(NamedTuple):
     Attributes:
         demonstration_reward: mean r_D over the demonstration batch.
         background_reward: mean r_D over the background batch, without appended demonstrations.
-        log_likelihood: the objective's data term, up to a constant.
-        log_prior: log P(theta) up to its constant.
+        log_likelihood: the data term of the objective, up to a constant.
+        log_prior: log P(theta), up to a constant.
         gradient_norm: global norm of the gradient that the optimiser was given.
-        effective_sample_size: (sum w)^2 / sum w^2 of the samples' weights.
+        effective_sample_size: (sum w)^2 / sum w^2 of the samples' weights w.
     """
 
     demonstration_reward: jax.Array
@@ -36,9 +36,9 @@ class RewardState(flax.struct.PyTreeNode):
     """A learned reward.
 
     Attributes:
-        params: of the reward, all that `RewardLearner.reward` reads.
-        optimizer: its optimiser's state.
-        hparams: the learner's hyperparameters.
+        params: parameters of r_D.
+        optimizer: state of the optimiser.
+        hparams: the learner's hyperparameters, numbers as `[]` float32.
     """
 
     params: Params
@@ -63,11 +63,11 @@ class UpdateFn(Protocol):
             state: the state before.
             demonstrations: the demonstration batch, leaves `[D, ...]`, or trajectories.
             background: the background batch, leaves `[B, ...]`, or trajectories.
-            key: for learners that draw.
+            key: randomness, for learners that draw.
 
         Raises:
-            ValueError: if a batch is not of the shapes that the learner takes, or `key` is missing.
-            TypeError: if a leaf is not of floats, or `terminated` or the mask not bool.
+            ValueError: if a batch has other shapes than the learner takes, or `key` is missing.
+            TypeError: if a leaf is not of floats, or `terminated` or the mask is not bool.
         """
         ...
 
@@ -77,11 +77,11 @@ class RewardLearner(NamedTuple):
 
     Attributes:
         init: `(key) -> RewardState`.
-        reward: `(state, observation [..., O], action [..., A]) -> [...]`, r_D(s, a; theta). While
-            tracing it raises ValueError for other shapes and TypeError for other dtypes.
+        reward: `(state, observation [..., O], action [..., A]) -> [...]`, r_D(s, a; theta). It
+            raises ValueError for wrong shapes and TypeError for wrong dtypes, while tracing.
         update: see `UpdateFn`.
-        absorbing: `(state) -> []`, r_D of the absorbing state that follows termination; None where
-            nothing follows it.
+        absorbing: `(state) -> []`, r_D of the absorbing state that follows termination; None if
+            there is no such state.
     """
 
     init: Callable[[jax.Array], RewardState]
@@ -97,7 +97,7 @@ def learn_nothing(
     *,
     key: jax.Array | None = None,
 ) -> tuple[RewardState, RewardInfo]:
-    """The update of a frozen reward."""
+    """The update of a reward that does not learn."""
     del demonstrations, background, key
     return state, no_info()
 
@@ -108,21 +108,21 @@ def no_info() -> RewardInfo:
 
 
 def pairs(spec: EnvSpec, batch: Transition | RewardBatch, name: str) -> RewardBatch:
-    """A batch of pairs, those without densities with uniform weights.
+    """Check a batch of pairs. A `Transition` becomes a `RewardBatch` of uniform weights.
 
     Raises:
-        ValueError: if it is not of shapes `[B, O]`, `[B, A]` and `[B]`.
-        TypeError: if a leaf is not of floats, or `terminated` or the mask not bool.
+        ValueError: if its shapes are not `[B, O]`, `[B, A]` and `[B]`.
+        TypeError: if a leaf is not of floats, or `terminated` or the mask is not bool.
     """
     return _checked(spec, batch, name, ("B",))
 
 
 def trajectories(spec: EnvSpec, batch: Transition | RewardBatch, name: str) -> RewardBatch:
-    """A batch of trajectories, those without densities with uniform weights.
+    """Check a batch of trajectories. A `Transition` becomes a `RewardBatch` of uniform weights.
 
     Raises:
-        ValueError: if it is not of shapes `[M, T, O]`, `[M, T, A]`, `[M, T]` and `[M]`.
-        TypeError: if a leaf is not of floats, or `terminated` or the mask not bool.
+        ValueError: if its shapes are not `[M, T, O]`, `[M, T, A]`, `[M, T]` and `[M]`.
+        TypeError: if a leaf is not of floats, or `terminated` or the mask is not bool.
     """
     return _checked(spec, batch, name, ("M", "T"))
 

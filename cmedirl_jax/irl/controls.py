@@ -1,5 +1,6 @@
-"""Rewards that learn nothing, to tell what a learned one does from what any extra reward does."""
+"""Rewards that learn nothing: controls for the effect of adding any reward at all."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -14,11 +15,17 @@ from cmedirl_jax.optimizers import traced
 from cmedirl_jax.types import EnvSpec, Network, Params
 
 PROBES = 1024
-"""Pairs at which a random reward is standardised."""
+"""State-action pairs over which a random reward is standardised."""
 
 
 class RandomParams(NamedTuple):
-    """A random reward: the network's parameters, and `[]` mean and deviation of its output."""
+    """Parameters of a random reward.
+
+    Attributes:
+        network: parameters of f.
+        mean: `[]`, mean of f over uniform pairs.
+        deviation: `[]`, standard deviation of f over uniform pairs.
+    """
 
     network: Params
     mean: jax.Array
@@ -26,63 +33,72 @@ class RandomParams(NamedTuple):
 
 
 def constant(value: float) -> RewardLearner:
-    """r_D = `value` everywhere."""
-
-    def init(key: jax.Array) -> RewardState:
-        del key
-        return RewardState(jnp.asarray(value, jnp.float32), (), ())
-
-    def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
-        del action
-        return jnp.broadcast_to(state.params, observation.shape[:-1])
-
-    return RewardLearner(init, reward, base.learn_nothing)
+    """Make r_D = `value` everywhere."""
+    return RewardLearner(
+        init=lambda key: RewardState(jnp.asarray(value, jnp.float32), (), ()),
+        reward=lambda state, observation, action: jnp.broadcast_to(
+            state.params, observation.shape[:-1]
+        ),
+        update=base.learn_nothing,
+    )
 
 
 def random(
     spec: EnvSpec, hparams: IRLHParams | None = None, *, network: Network | None = None
 ) -> RewardLearner:
-    """r_D = bound tanh(f), f a random network with mean 0 and deviation 1 over uniform pairs.
+    """Make r_D = bound tanh(f), f a random network with mean 0 and deviation 1 over uniform pairs.
 
-    So it is of the scale of a learned reward with the same bound, and says nothing.
+    It is bounded like a learned reward, and carries no information about the task.
 
     Args:
-        spec: whose bounds must be finite.
-        hparams: of which the bound is read.
-        network: default `rewards.mlp(spec)`; its parameters are drawn such that it varies.
+        spec: the environment's sizes and bounds, which have to be finite.
+        hparams: only the bound is read.
+        network: default `rewards.mlp(spec)`. Its first parameters have to make it vary.
 
     Raises:
         ValueError: if a bound is infinite.
     """
     if not all(np.isfinite(bound).all() for bound in _bounds(spec)):
         raise ValueError(f"{spec.id}: uniform pairs need finite bounds, got {_bounds(spec)}")
-    hparams = hparams or IRLHParams()
     network = network or rewards.mlp(spec)
+    return RewardLearner(
+        init=functools.partial(_init_random, spec, network, hparams or IRLHParams()),
+        reward=functools.partial(_random_reward, spec, network),
+        update=base.learn_nothing,
+    )
 
-    def init(key: jax.Array) -> RewardState:
-        network_key, observation_key, action_key = jax.random.split(key, 3)
-        params = network.init(network_key)
-        observation_low, observation_high, action_low, action_high = _bounds(spec)
-        output = network.apply(
-            params,
-            _uniform(observation_key, observation_low, observation_high),
-            _uniform(action_key, action_low, action_high),
-        )
-        standardised = RandomParams(params, jnp.mean(output), jnp.std(output))
-        return RewardState(standardised, (), traced(hparams))
 
-    def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
-        checks.pairs(spec, observation, action)
-        params, mean, deviation = state.params
-        output = (network.apply(params, observation, action) - mean) / deviation
-        return regularisers.bounded(output, state.hparams.bound)
+def _init_random(
+    spec: EnvSpec, network: Network, hparams: IRLHParams, key: jax.Array
+) -> RewardState:
+    network_key, observation_key, action_key = jax.random.split(key, 3)
+    params = network.init(network_key)
+    observation_low, observation_high, action_low, action_high = _bounds(spec)
+    output = network.apply(
+        params,
+        _uniform(observation_key, observation_low, observation_high),
+        _uniform(action_key, action_low, action_high),
+    )
+    standardised = RandomParams(params, jnp.mean(output), jnp.std(output))
+    return RewardState(standardised, (), traced(hparams))
 
-    return RewardLearner(init, reward, base.learn_nothing)
+
+def _random_reward(
+    spec: EnvSpec,
+    network: Network,
+    state: RewardState,
+    observation: jax.Array,
+    action: jax.Array,
+) -> jax.Array:
+    checks.pairs(spec, observation, action)
+    params, mean, deviation = state.params
+    output = (network.apply(params, observation, action) - mean) / deviation
+    return regularisers.bounded(output, state.hparams.bound)
 
 
 def _bounds(spec: EnvSpec) -> tuple[np.ndarray, ...]:
     return spec.observation_low, spec.observation_high, spec.action_low, spec.action_high
 
 
-def _uniform(key: jax.Array, low, high) -> jax.Array:
+def _uniform(key: jax.Array, low: np.ndarray, high: np.ndarray) -> jax.Array:
     return jax.random.uniform(key, (PROBES, len(low)), minval=low, maxval=high)

@@ -1,19 +1,24 @@
 """The data term of the log-likelihood, L_D, estimated from samples.
 
-The derivative of each by the rewards is mu_D - E[mu] (Eqs. 6 and 8), both undiscounted and of sum
-one: the frequency of the batch of demonstrations minus that of weighted samples. They differ in the
-weights `w`:
+The derivative of each objective by the rewards is mu_D - E[mu] (Eqs. 6 and 8), both undiscounted
+and with sum one: the frequencies in the batch of demonstrations, minus those among weighted
+samples. The objectives differ in the weights `w`:
 
-- `visitation`: w ~ z. The plain difference of two means; linear in the reward, so nothing in it
-  holds the reward back.
+- `visitation`: w ~ z. The plain difference of two means. It is linear in the reward and does not
+  bound it.
 - `transition`: w ~ z exp r(s, a). Every sampled pair is a trajectory of its own.
 - `trajectory`: w ~ z exp R(tau), Guided Cost Learning (Finn et al. 2016, Algorithm 2).
 
-`z` is the derivative of the base measure (see `irl.densities`) by the law that the samples came
-from: uniform, or 1 / density. Appending the demonstrations to the samples (Algorithm 1, line 4)
-keeps the two exponential objectives bounded; the linear one, of uniform weights, it only rescales.
+`z` is 1, or the importance weight 1 / density, where the density of the samples' law is with
+respect to the base measure of `agents.densities`. Appending the demonstrations to the samples
+(Algorithm 1, line 4) bounds the two exponential objectives. It only rescales the linear one with
+uniform weights.
+
+A new objective needs, all in this file: its function, its name in `ObjectiveName`, and an entry in
+`OBJECTIVES`.
 """
 
+import functools
 from typing import Literal, NamedTuple, Protocol
 
 import jax
@@ -28,12 +33,12 @@ ObjectiveName = Literal["visitation", "transition", "trajectory"]
 
 
 class Scored(NamedTuple):
-    """A batch under a reward, `[...]` being `[B]` for pairs and `[M]` for trajectories.
+    """A batch under a reward. `[...]` is `[B]` for pairs and `[M]` for trajectories.
 
     Attributes:
         reward: `[...]`, r(s, a) of each pair, or the return R(tau) of each trajectory.
         log_weight: `[...]`, log z; -inf leaves an entry out of the samples.
-        mask: `[...]` bool; False leaves it out altogether.
+        mask: `[...]` bool; False leaves an entry out of the demonstrations too.
     """
 
     reward: jax.Array
@@ -42,11 +47,11 @@ class Scored(NamedTuple):
 
 
 class Likelihood(NamedTuple):
-    """An estimate.
+    """An estimate of L_D.
 
     Attributes:
         value: `[]`, L_D up to a constant.
-        effective_sample_size: `[]`, (sum w)^2 / sum w^2, of at most as many as there are samples.
+        effective_sample_size: `[]`, (sum w)^2 / sum w^2, at most the number of samples.
     """
 
     value: jax.Array
@@ -88,8 +93,9 @@ class Objective(NamedTuple):
     Attributes:
         likelihood: see `LikelihoodFn`.
         score: see `ScoreFn`.
-        trajectories: it takes batches of whole trajectories, not of pairs.
-        needs_bound: nothing in it bounds the reward of an absorbing state; `bounded_by` has to.
+        trajectories: whether it takes batches of whole trajectories, not of pairs.
+        needs_bound: whether the reward of an absorbing state has to be bounded by
+            `IRLHParams.bounded_by`, because the objective does not bound it.
     """
 
     likelihood: LikelihoodFn
@@ -116,9 +122,9 @@ def visitation(demonstrations: Scored, background: Scored, *, append: bool) -> L
 def transition(demonstrations: Scored, background: Scored, *, append: bool) -> Likelihood:
     """mean_D r - log mean_i [z_i exp r_i], over pairs.
 
-    At the optimum over all functions, with the demonstrations appended: for uniform z,
-    r = log(rho_D / mixture) + c; for z = 1 / b_mix(a|s), r = log(rho_D(s, a) / mixture(s)) + c,
-    where `mixture` is the law of the samples.
+    With the demonstrations appended, the optimum over all functions is r = log(rho_D / mixture) + c
+    for uniform z, and r = log(rho_D(s, a) / mixture(s)) + c for z = 1 / b_mix(a|s), where `mixture`
+    is the law of the samples.
 
     Args:
         demonstrations: scored pairs.
@@ -131,11 +137,11 @@ def transition(demonstrations: Scored, background: Scored, *, append: bool) -> L
 def trajectory(demonstrations: Scored, background: Scored, *, append: bool) -> Likelihood:
     """mean_D R - log mean_j [z_j exp R_j], over trajectories (Guided Cost Learning).
 
-    With R undiscounted, deterministic dynamics and one start this is, in the limit of many samples,
-    the exact likelihood of `tabular.maxent`. With a discounted R it is not.
+    In the limit of many samples this is the exact likelihood of `tabular.maxent`, for an
+    undiscounted R, deterministic dynamics and a single start.
 
     Args:
-        demonstrations: scored trajectories; their returns are those of `returns`.
+        demonstrations: scored trajectories.
         background: scored trajectories.
         append: whether the demonstrations join the samples.
     """
@@ -182,38 +188,40 @@ def weighed(
     exponent: Numeric = 1.0,
     limit: Numeric | None = None,
 ) -> tuple[Scored, Scored]:
-    """Temper and clip the weights of both batches, about the mean of the samples' logarithms.
+    """Temper the weights of both batches, and clip them about the mean of the samples' logarithms.
 
-    That trades the weights' variance for a bias; over the hundreds of steps of a trajectory they
-    collapse onto one sample without it.
+    This reduces the weights' variance and adds a bias. Without it the weights of trajectories of
+    hundreds of steps collapse onto one sample.
 
     Args:
         demonstrations: scored.
         background: scored.
         append: whether the demonstrations are among the samples.
-        exponent: z^exponent in place of z; 0 gives uniform weights.
-        limit: largest distance of log z^exponent from its mean; None for any.
+        exponent: replaces z by z^exponent; 0 gives uniform weights.
+        limit: largest distance of log z^exponent from its mean; None: no limit.
     """
     samples = _samples(demonstrations, background, append)
     counts = _counts(samples)
     centre = masked_mean(jnp.where(counts, exponent * samples.log_weight, 0.0), counts)
 
-    def weigh(scored: Scored) -> Scored:
-        # Of weight zero stays so, whatever the exponent.
-        some = scored.log_weight != -jnp.inf
-        log_weight = exponent * jnp.where(some, scored.log_weight, 0.0)
-        if limit is not None:
-            log_weight = jnp.clip(log_weight, centre - limit, centre + limit)
-        return scored._replace(log_weight=jnp.where(some, log_weight, -jnp.inf))
-
+    weigh = functools.partial(_weigh, centre, exponent, limit)
     return weigh(demonstrations), weigh(background)
 
 
-def log_weight(log_density: jax.Array) -> jax.Array:
-    """log z of samples of a given log density with respect to the base measure: `[B]` -> `[B]`.
+def _weigh(centre: jax.Array, exponent: Numeric, limit: Numeric | None, scored: Scored) -> Scored:
+    # A weight of zero stays zero, whatever the exponent.
+    some = scored.log_weight != -jnp.inf
+    log_weight = exponent * jnp.where(some, scored.log_weight, 0.0)
+    if limit is not None:
+        log_weight = jnp.clip(log_weight, centre - limit, centre + limit)
+    return scored._replace(log_weight=jnp.where(some, log_weight, -jnp.inf))
 
-    An infinite density, at an atom that the base measure lacks, gives weight 0; so does a density
-    of zero, which says that the sample is not of this law at all.
+
+def log_weight(log_density: jax.Array) -> jax.Array:
+    """log z = -log density, with respect to the base measure: `[B]` -> `[B]`.
+
+    An infinite density, at an atom that the base measure lacks, gives weight 0. So does a density
+    of zero: such a sample cannot come from this law.
     """
     return jnp.where(jnp.isinf(log_density), -jnp.inf, -log_density)
 
@@ -231,7 +239,7 @@ def _log_partition_likelihood(
 
 
 def _likelihood(value: jax.Array, weight: jax.Array, some: jax.Array) -> Likelihood:
-    """With no sample to hold the demonstrations against, there is nothing to learn."""
+    """The estimate; zeros if there is no sample to compare the demonstrations with."""
     total = jnp.sum(jnp.square(jax.lax.stop_gradient(weight)))
     return Likelihood(
         value=jnp.where(some, value, 0.0),
@@ -254,7 +262,7 @@ def _mean(scored: Scored) -> jax.Array:
 
 
 def _normalised(log_weight: jax.Array, counts: jax.Array) -> jax.Array:
-    """Weights that sum to one, or are all zero where nothing counts."""
+    """Weights with sum one; all zero if no entry counts."""
     largest = jax.lax.stop_gradient(jnp.max(log_weight, initial=-jnp.inf, where=counts))
     weight = jnp.where(counts, jnp.exp(jnp.where(counts, log_weight - largest, 0.0)), 0.0)
     return weight / jnp.maximum(jnp.sum(weight), 1.0)

@@ -1,8 +1,8 @@
 """What keeps a learned reward regular: priors, penalties, bounds, a gauge, absorbing states.
 
-A constant added to r_D is not identified by demonstrations, but it changes the policy in an
-episodic task: loitering beats finishing once r_D > (1 - gamma) / gamma times the reward of
-finishing. Hence bounds and a gauge; absorbing states are the other remedy.
+Demonstrations do not identify a constant that is added to r_D, but the constant changes the policy
+in an episodic task: staying alive is better than finishing once r_D exceeds (1 - gamma) / gamma
+times the reward of finishing. Bounds and a gauge prevent this; so do absorbing states.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ def log_prior(params: Params, precision: Numeric) -> jax.Array:
 
 
 def output_penalty(output: jax.Array, mask: jax.Array) -> jax.Array:
-    """Mean of f^2 over the entries of `mask`: `[B]` -> `[]`."""
+    """Mean of f^2 over the entries where `mask` is True: `[B]` -> `[]`."""
     return masked_mean(jnp.square(output), mask)
 
 
@@ -43,31 +43,31 @@ def gradient_penalty(
         function: f of one pair, `[O]`, `[A]` -> `[]`.
         observation: `[B, O]`, where the gradient is taken; see `interpolate`.
         action: `[B, A]`.
-        mask: `[B]` bool, which of them count.
-        scale: units of observations `[O]` and actions `[A]` in which the gradient is measured.
-        target: of the gradient's norm.
+        mask: `[B]` bool, which pairs count.
+        scale: the gradient's units, of observations `[O]` and of actions `[A]`.
+        target: the norm of the gradient that is not penalised.
     """
     by_pair = jax.vmap(jax.grad(function, argnums=(0, 1)))(observation, action)
     squared = sum(
         jnp.sum(jnp.square(slope * unit), axis=-1)
         for slope, unit in zip(by_pair, scale, strict=True)
     )
-    # The root has no derivative at zero, where a plain square does.
+    # The square root has no derivative at zero.
     steep = squared > 1e-12
     norm = jnp.where(steep, jnp.sqrt(jnp.where(steep, squared, 1.0)), 0.0)
     return masked_mean(squared - 2.0 * target * norm + target**2, mask)
 
 
 def interpolate(key: jax.Array, demonstrations: Any, background: Any) -> Any:
-    """Points at a random place between the first pairs of one batch and those of the other.
+    """Random points on the lines between the entries of two batches.
 
     Args:
         key: randomness.
-        demonstrations: any pytree with leaves `[D, ...]`.
-        background: the same with leaves `[B, ...]`.
+        demonstrations: a pytree with leaves `[D, ...]`.
+        background: a pytree of the same structure with leaves `[B, ...]`.
 
     Returns:
-        The pytree with leaves `[min(D, B), ...]`.
+        A pytree with leaves `[min(D, B), ...]`.
     """
     size = min(jax.tree.leaves(tree)[0].shape[0] for tree in (demonstrations, background))
     share = jax.random.uniform(key, (size,))
@@ -83,7 +83,7 @@ def bounded(output: jax.Array, bound: Numeric, kind: BoundKind = "tanh") -> jax.
     """r_D of f, `[...]` -> `[...]`.
 
     - "tanh": bound * tanh(f), |r_D| < bound everywhere.
-    - "clip": f clipped to +-bound. Past it nothing but the penalty on f brings f back.
+    - "clip": f clipped to +-bound. Beyond the bound only the penalty on f has a gradient.
     - "none": f.
     """
     match kind:
@@ -100,15 +100,15 @@ def gauge_offset(
     demonstrations: tuple[jax.Array, jax.Array],
     background: tuple[jax.Array, jax.Array],
 ) -> jax.Array:
-    """The constant that the gauge takes off r_D, `[]`, on a batch of each; 0 on an empty one.
+    """The constant `[]` that the gauge subtracts from r_D, estimated on batches; 0 on empty ones.
 
     - "none": 0.
     - "zero-mean": the mean of r_D over the background.
     - "demonstration-maximum": the largest r_D of the demonstrations, so that demonstrated pairs
-      earn about nothing at best; the learner follows it batch by batch.
+      earn at most about zero.
 
     Args:
-        kind: which.
+        kind: which gauge.
         demonstrations: r_D of the demonstrated pairs `[D]`, and their mask.
         background: r_D of the background pairs `[B]`, and their mask.
     """
@@ -124,19 +124,20 @@ def gauge_offset(
 
 
 def absorbed_reward(absorbing: jax.Array, terminated: jax.Array, discount: Numeric) -> jax.Array:
-    """What a transition earns after its end: discount / (1 - discount) r_D(absorbing), `[...]`.
+    """What follows a termination: discount / (1 - discount) r_D(absorbing), else 0: `[...]`.
 
     An episode that terminates goes on for ever in an absorbing state whose reward is learned too
-    (Kostrikov et al. 2019, "Discriminator-Actor-Critic", section 4.2), summed up at once.
+    (Kostrikov et al. 2019, "Discriminator-Actor-Critic", section 4.2). This is the sum of all those
+    rewards.
 
     Args:
         absorbing: `[]`, r_D of the absorbing state.
         terminated: `[...]` bool.
-        discount: the agent's, below 1.
+        discount: the agent's, below 1, per environment step.
     """
     return jnp.where(terminated, discount / (1.0 - discount) * absorbing, 0.0)
 
 
 def masked_mean(values: jax.Array, mask: jax.Array) -> jax.Array:
-    """Mean over the entries of `mask`, 0 where there is none: `[...]` -> `[]`."""
+    """Mean over the entries where `mask` is True, 0 if there is none: `[...]` -> `[]`."""
     return jnp.sum(jnp.where(mask, values, 0.0)) / jnp.maximum(jnp.sum(mask), 1)

@@ -2,11 +2,16 @@
 
     network = rewards.linear(spec, rewards.fourier(spec, order=3))
 
-All take an observation `[..., O]` and an action `[..., A]`, floats with the same leading axes, else
-ValueError, or TypeError for other dtypes; those of the inputs "state" ignore the action.
+All take an observation `[..., O]` and an action `[..., A]`, floats with the same leading axes; they
+raise ValueError for other shapes and TypeError for other dtypes. With inputs "state" they ignore
+the action.
+
+A new kind of network needs, all in this file: its function, its fields in `RewardNetworkSettings`,
+its name in `NetworkName`, and an entry in `NETWORKS`.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
@@ -38,7 +43,8 @@ class RewardNetworkSettings:
         inputs: r(s, a), or r(s).
         hidden: Units of each hidden layer of a deep reward.
         centres: Radial basis functions along each dimension of the observation.
-        order: Highest frequency of the Fourier basis, along each dimension of its inputs.
+        order: Highest frequency of the Fourier basis along each dimension of its inputs, in half
+            periods of the input's range.
     """
 
     kind: NetworkName = "deep"
@@ -53,8 +59,8 @@ class NetworkKind(NamedTuple):
 
     Attributes:
         make: `(spec, settings, inputs) -> Network`; of the settings it reads its own fields.
-        starts_at_zero: its first parameters give r_D = 0 everywhere, so that a random reward
-            cannot be made of it.
+        starts_at_zero: whether its first parameters give r_D = 0 everywhere, so that it cannot be
+            the network of a random reward.
     """
 
     make: Callable[[EnvSpec, RewardNetworkSettings, Inputs], Network]
@@ -72,7 +78,7 @@ def make(
         state_only: make r(s), as a potential needs, whatever `settings.inputs` says.
 
     Raises:
-        ValueError: for an unknown kind, or a specification that the kind cannot be made for.
+        ValueError: for an unknown kind, or one that needs finite bounds that `spec` lacks.
     """
     settings = settings or RewardNetworkSettings()
     inputs = "state" if state_only else settings.inputs
@@ -84,8 +90,8 @@ def mlp(
 ) -> Network:
     """A deep reward: observation `[..., O]`, action `[..., A]` -> `[...]`, before any bound.
 
-    The critic's shape without its normalisation: the observation, scaled to [-1, 1], and the action
-    joined at the input. Of the state alone: the actor's, with one output.
+    It is the critic's network without normalisation: the observation is scaled to [-1, 1], and the
+    action joins at the input. With inputs "state" it is the actor's network with one output.
 
     Raises:
         ValueError: if the observation has an infinite bound.
@@ -93,27 +99,31 @@ def mlp(
     architecture = networks.Architecture(hidden=hidden, critic_normalisation="none")
     if inputs == "state-action":
         network = networks.critic(spec, architecture)
+        return network._replace(apply=functools.partial(_apply_to_pairs, spec, network))
+    network = networks.scalar_output(networks.actor(spec._replace(action_dim=1), architecture))
+    return network._replace(apply=functools.partial(_apply_to_states, spec, network))
 
-        def apply(params: Params, observation: Array, action: Array) -> jax.Array:
-            checks.pairs(spec, observation, action)
-            return network.apply(params, observation, action)
 
-        return network._replace(apply=apply)
-    of_state = networks.scalar_output(networks.actor(spec._replace(action_dim=1), architecture))
+def _apply_to_pairs(
+    spec: EnvSpec, network: Network, params: Params, observation: Array, action: Array
+) -> jax.Array:
+    checks.pairs(spec, observation, action)
+    return network.apply(params, observation, action)
 
-    def apply_to_state(params: Params, observation: Array, action: Array) -> jax.Array:
-        del action
-        checks.pairs(spec, observation)
-        return of_state.apply(params, observation)
 
-    return of_state._replace(apply=apply_to_state)
+def _apply_to_states(
+    spec: EnvSpec, network: Network, params: Params, observation: Array, action: Array
+) -> jax.Array:
+    del action
+    checks.pairs(spec, observation)
+    return network.apply(params, observation)
 
 
 def linear(spec: EnvSpec, features: Features) -> Network:
     """theta^T phi (Eq. 1): observation `[..., O]`, action `[..., A]` -> `[...]`; theta is `[F]`.
 
-    It starts from theta = 0 whatever the key: no symmetry is to be broken, without a bound the
-    likelihood is concave in theta, and a reward of zero prefers nothing.
+    It starts from theta = 0 and ignores the key: there is no symmetry to break, and a reward of zero
+    has no preference. Without a bound the likelihood is concave in theta.
     """
     size = jax.eval_shape(features, spec.observation_low, spec.action_low).shape[-1]
     return Network(
@@ -125,9 +135,10 @@ def linear(spec: EnvSpec, features: Features) -> Network:
 def radial_basis(spec: EnvSpec, centres: int, inputs: Inputs = "state-action") -> Features:
     """Features of a linear reward (Eq. 1): `centres^O` Gaussians of the observation.
 
-    They lie on a regular grid of `centres` per dimension over its bounds, as wide as they lie apart
-    and normalised to sum to one. Of "state-action": times 1, a and a^2 of each action, so that the
-    reward is a quadratic of the action whose coefficients vary over the states.
+    They lie on a regular grid over the observation's bounds, `centres` along each dimension. Their
+    width is the grid's spacing, and they are normalised to sum to one. With inputs "state-action"
+    they are multiplied by 1, a and a^2 of each action, which makes the reward a quadratic function
+    of the action whose coefficients vary over the states.
 
     Raises:
         ValueError: if there are fewer than two centres, or the observation has an infinite bound.
@@ -137,28 +148,35 @@ def radial_basis(spec: EnvSpec, centres: int, inputs: Inputs = "state-action") -
     scale = networks.observation_scaling(spec)
     axis = np.linspace(-1.0, 1.0, centres)
     grid = grids.product(*[axis] * spec.observation_dim)
-    width = axis[1] - axis[0]
+    return functools.partial(_radial_basis, spec, inputs, scale, grid, axis[1] - axis[0])
 
-    def features(observation: Array, action: Array) -> jax.Array:
-        checks.pairs(spec, observation, None if inputs == "state" else action)
-        away = (scale(jnp.asarray(observation))[..., None, :] - grid) / width
-        local = jax.nn.softmax(-0.5 * jnp.sum(jnp.square(away), axis=-1), axis=-1)
-        if inputs == "state":
-            return local
-        of_action = jnp.concatenate(
-            [jnp.ones_like(action[..., :1]), action, jnp.square(action)], axis=-1
-        )
-        both = local[..., :, None] * of_action[..., None, :]
-        return both.reshape(*both.shape[:-2], -1)
 
-    return features
+def _radial_basis(
+    spec: EnvSpec,
+    inputs: Inputs,
+    scale: Callable[[jax.Array], jax.Array],
+    grid: np.ndarray,
+    width: float,
+    observation: Array,
+    action: Array,
+) -> jax.Array:
+    checks.pairs(spec, observation, None if inputs == "state" else action)
+    away = (scale(jnp.asarray(observation))[..., None, :] - grid) / width
+    local = jax.nn.softmax(-0.5 * jnp.sum(jnp.square(away), axis=-1), axis=-1)
+    if inputs == "state":
+        return local
+    of_action = jnp.concatenate(
+        [jnp.ones_like(action[..., :1]), action, jnp.square(action)], axis=-1
+    )
+    both = local[..., :, None] * of_action[..., None, :]
+    return both.reshape(*both.shape[:-2], -1)
 
 
 def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Features:
     """Features of a linear reward (Eq. 1): the Fourier basis of Konidaris et al. (2011).
 
-    cos(pi c.x) for every c in {0, ..., order}^d, the last dimension fastest; x are the `d` inputs
-    scaled to [0, 1], the observation and then the action.
+    The features are cos(pi c.x) for every c in {0, ..., order}^d, the last dimension fastest. x are
+    the `d` inputs scaled to [0, 1]: the observation, and then the action.
 
     Raises:
         ValueError: if the order is less than one, or an input has an infinite bound.
@@ -171,15 +189,23 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
     if not np.isfinite([low, high]).all():
         raise ValueError(f"{spec.id}: a Fourier basis needs finite bounds, got {low} and {high}")
     frequencies = np.pi * grids.product(*[np.arange(order + 1.0)] * len(low))
+    return functools.partial(_fourier, spec, inputs, low, high, frequencies)
 
-    def features(observation: Array, action: Array) -> jax.Array:
-        checks.pairs(spec, observation, None if inputs == "state" else action)
-        if inputs == "state-action":
-            observation = jnp.concatenate([observation, action], axis=-1)
-        x = (observation - low) / (high - low)
-        return jnp.cos(jnp.sum(x[..., None, :] * frequencies, axis=-1))
 
-    return features
+def _fourier(
+    spec: EnvSpec,
+    inputs: Inputs,
+    low: np.ndarray,
+    high: np.ndarray,
+    frequencies: np.ndarray,
+    observation: Array,
+    action: Array,
+) -> jax.Array:
+    checks.pairs(spec, observation, None if inputs == "state" else action)
+    if inputs == "state-action":
+        observation = jnp.concatenate([observation, action], axis=-1)
+    x = (observation - low) / (high - low)
+    return jnp.cos(jnp.sum(x[..., None, :] * frequencies, axis=-1))
 
 
 NETWORKS: Registry[NetworkKind] = Registry(

@@ -14,16 +14,16 @@ Shaping = Literal["additive", "potential", "alone"]
 def additive(
     environment_reward: jax.Array, learned_reward: jax.Array, weight: Numeric = 1.0
 ) -> jax.Array:
-    """r* = r_e + weight r_D (Eq. 10, where the weight is 1; annealed, it falls).
+    """r* = r_e + weight r_D (Eq. 10, where the weight is 1).
 
     Args:
         environment_reward: `[...]`, r_e.
         learned_reward: `[...]`, r_D.
-        weight: `[]`, of r_D.
+        weight: `[]`, of r_D; lower it over time to anneal r_D.
 
     Raises:
-        ValueError: if the shapes differ, or the weight is no scalar.
-        TypeError: if the rewards are not floats.
+        ValueError: if the shapes differ, or the weight is not a scalar.
+        TypeError: if the rewards are not of floats.
     """
     _check(weight, environment_reward=environment_reward, learned_reward=learned_reward)
     return environment_reward + weight * learned_reward
@@ -37,21 +37,21 @@ def potential(
     discount: Numeric,
     weight: Numeric = 1.0,
 ) -> jax.Array:
-    """r* = r_e + weight (discount Phi(s') - Phi(s)), which leaves every optimal policy optimal.
+    """r* = r_e + weight (discount Phi(s') - Phi(s)), which keeps the optimal policies optimal.
 
-    Ng, Harada and Russell 1999. Phi is 0 past a termination, not past a truncation. With a weight
-    that changes over time, or a Phi that is still learned, the invariance is lost.
+    Ng, Harada and Russell 1999. Phi is 0 after a termination, but not after a truncation. The
+    policies are not kept if the weight changes over time, or while Phi is still learned.
 
     Args:
         environment_reward: `[...]`, r_e.
         before: `[...]`, Phi(s).
         after: `[...]`, Phi(s').
         terminated: `[...]` bool.
-        discount: `[]`, the agent's.
+        discount: `[]`, the agent's, per environment step.
         weight: `[]`, of the potential.
 
     Raises:
-        ValueError: if the shapes differ, or the discount or the weight is no scalar.
+        ValueError: if the shapes differ, or the discount or the weight is not a scalar.
         TypeError: if `terminated` is not bool, or another array is not of floats.
     """
     _check(weight, environment_reward=environment_reward, before=before, after=after)

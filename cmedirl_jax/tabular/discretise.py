@@ -4,11 +4,12 @@
     policy = soft_value_iteration(mdp.dynamics, mdp.reward, discount=0.99, absorbing=mdp.absorbing)
     act = discretise.greedy(mdp, policy.action_values)
 
-The states are the points of a grid over the observations and one absorbing state where every
-terminated episode ends. A transition is the environment's own, from the point (or from several
-around it); where it leads is shared among the neighbouring points by multilinear weights.
+The states are the points of a grid over the observations, and one absorbing state in which every
+terminated episode ends. Transitions are the environment's own, from each point (or from several
+around it). Each successor is shared among the neighbouring points by multilinear weights.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -54,12 +55,12 @@ def make(
     """Discretise an environment whose steps do not draw random numbers.
 
     Args:
-        env: whose `state_at` says which state an observation is of.
+        env: the environment; it has to have a `state_at`.
         state_shape: points along each dimension of the observation.
         action_shape: points along each dimension of the action.
         params: default `env.default_params`.
-        subsamples: transitions per dimension that are averaged for each state, evenly spread over
-            the cell around its point; 1 takes the point itself.
+        subsamples: transitions along each dimension that are averaged for a state, evenly spread
+            over the cell around its point; 1 takes the point itself.
 
     Raises:
         ValueError: if the environment has no `state_at`, an infinite bound, or other dimensions.
@@ -68,41 +69,65 @@ def make(
         raise ValueError(f"{env.spec.id} does not say which state an observation is of")
     if subsamples < 1:
         raise ValueError(f"subsamples must be at least 1, got {subsamples}")
-    spec, state_at = env.spec, env.state_at
-    params = env.default_params if params is None else params
-    states, actions = grids(spec, state_shape, action_shape)
+    states, actions = grids(env.spec, state_shape, action_shape)
     within = (np.arange(subsamples) + 0.5) / subsamples - 0.5
     offsets = grids_lib.product(*[within] * len(states.shape))
 
-    def step(observation: jax.Array, action: jax.Array) -> Step:
-        inside = jnp.clip(observation, spec.observation_low, spec.observation_high)
-        return env.step(jax.random.key(0), state_at(inside, params), action, params)[1]
-
-    def of_pair(point: jax.Array, action: jax.Array):
-        around = point + offsets.astype(np.float32) * states.spacing.astype(np.float32)
-        found = jax.vmap(step, in_axes=(0, None))(around, action)
-        index, weight = interpolation.interpolate(states, found.observation)
-        index = jnp.where(found.terminated[:, None], states.size, index)
-        return index.ravel(), weight.ravel() / len(offsets), jnp.mean(found.reward)
-
-    over_actions = jax.vmap(of_pair, in_axes=(None, 0))
-    # Kept from the compiler, which would evaluate all that follows from constants.
+    # Every pair of points. The barrier keeps the compiler from evaluating the rest as constants.
+    of_pair = functools.partial(
+        _successors, env, env.default_params if params is None else params, states, offsets
+    )
     pairs = jax.lax.optimization_barrier(
         (jnp.asarray(interpolation.points(states)), jnp.asarray(interpolation.points(actions)))
     )
+    over_actions = jax.vmap(of_pair, in_axes=(None, 0))
     index, weight, reward = jax.vmap(over_actions, in_axes=(0, None))(*pairs)
 
-    def with_absorbing(leaf: jax.Array, value: float) -> jax.Array:
-        return jnp.concatenate([leaf, jnp.full_like(leaf[:1], value)])
-
-    share = 1.0 / weight.shape[-1]
+    # The absorbing state leads to itself.
+    index = _append_row(index, states.size)
+    weight = _append_row(weight, 1.0 / weight.shape[-1])
     return FiniteMDP(
-        SparseDynamics(with_absorbing(index, states.size), with_absorbing(weight, share)),
-        with_absorbing(reward, 0.0),
+        SparseDynamics(index, weight),
+        _append_row(reward, 0.0),
         jnp.arange(states.size + 1) == states.size,
         states,
         actions,
     )
+
+
+def _successors(
+    env: Env,
+    params: Any,
+    states: Grid,
+    offsets: np.ndarray,
+    point: jax.Array,
+    action: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Successors `[K]` of a grid point under an action, their probabilities, and the reward `[]`.
+
+    Args:
+        env: whose `state_at` is given.
+        params: its parameters.
+        states: grid of the observations.
+        offsets: `[M, O]`, where transitions begin around a point, in units of the grid's spacing.
+        point: `[O]`.
+        action: `[A]`.
+    """
+    around = point + offsets.astype(np.float32) * states.spacing.astype(np.float32)
+    answer = jax.vmap(functools.partial(_step_from, env, params), in_axes=(0, None))(around, action)
+    index, weight = interpolation.interpolate(states, answer.observation)
+    index = jnp.where(answer.terminated[:, None], states.size, index)
+    return index.ravel(), weight.ravel() / len(offsets), jnp.mean(answer.reward)
+
+
+def _step_from(env: Env, params: Any, observation: jax.Array, action: jax.Array) -> Step:
+    assert env.state_at is not None
+    inside = jnp.clip(observation, env.spec.observation_low, env.spec.observation_high)
+    return env.step(jax.random.key(0), env.state_at(inside, params), action, params)[1]
+
+
+def _append_row(leaf: jax.Array, value: float) -> jax.Array:
+    return jnp.concatenate([leaf, jnp.full_like(leaf[:1], value)])
 
 
 def look_up(mdp: FiniteMDP, table: Array, observation: Array) -> jax.Array:
@@ -118,7 +143,7 @@ def greedy(mdp: FiniteMDP, action_values: Array) -> Callable[[jax.Array], jax.Ar
     """The policy that takes the best action of the grid: `[..., O]` -> `[..., A]`.
 
     Args:
-        mdp: whose grids.
+        mdp: the grids.
         action_values: Q `[S, A]` (or any other preference).
     """
     actions = jnp.asarray(interpolation.points(mdp.actions))
@@ -130,11 +155,11 @@ def greedy(mdp: FiniteMDP, action_values: Array) -> Callable[[jax.Array], jax.Ar
 
 
 def sampled(mdp: FiniteMDP, env: Env) -> Env:
-    """`env` with log-probabilities over the grid's actions for actions, drawn by the step's key.
+    """`env` whose actions are log-probabilities of the grid's actions.
 
-    It makes a stochastic policy out of one that only reads observations, so that
-    `evaluation.rollout` can run it: `lambda o: look_up(mdp, policy.log_probabilities, o)`. Its
-    specification has so many actions as the grid; a log-probability may also be -inf.
+    Each step draws an action of the grid with its key. `evaluation.rollout` can thus run a
+    stochastic policy: `lambda o: look_up(mdp, policy.log_probabilities, o)`. The action dimension
+    is the number of the grid's actions. A log-probability may be -inf.
     """
     actions = jnp.asarray(interpolation.points(mdp.actions))
 
@@ -155,7 +180,11 @@ def sampled(mdp: FiniteMDP, env: Env) -> Env:
 def grids(
     spec: EnvSpec, state_shape: Sequence[int], action_shape: Sequence[int]
 ) -> tuple[Grid, Grid]:
-    """Grids over the bounds of the observations and of the actions."""
+    """Grids over the bounds of the observations and of the actions.
+
+    Raises:
+        ValueError: if a bound is infinite, or the shapes do not have the specification's sizes.
+    """
 
     def over(low: np.ndarray, high: np.ndarray, shape: Sequence[int]) -> Grid:
         return Grid(tuple(map(float, low)), tuple(map(float, high)), tuple(shape))

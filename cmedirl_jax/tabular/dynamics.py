@@ -10,11 +10,11 @@ from cmedirl_jax.types import Array
 
 
 class SparseDynamics(NamedTuple):
-    """At most `K` successors of each state and action; the same one may be listed more than once.
+    """Up to `K` successors of each state and action; a successor may be listed more than once.
 
     Attributes:
-        next_state: `[S, A, K]` int32.
-        probability: `[S, A, K]`, summing to one over `K`.
+        next_state: `[S, A, K]` int32, the successors.
+        probability: `[S, A, K]`, their probabilities, with sum 1 over `K`.
     """
 
     next_state: Array
@@ -41,16 +41,16 @@ def next_distribution(dynamics: Dynamics, visits: jax.Array) -> jax.Array:
 
 
 def check(dynamics: Dynamics, state_actions: tuple[int, ...], **of_states: Array | None) -> None:
-    """Refuse dynamics that are not of `state_actions`, (S, A), and other arrays that are not `[S]`.
+    """Check the dynamics of a decision process, and arrays that have an entry for each state.
 
     Args:
         dynamics: P(s'|s,a).
-        state_actions: the reward's shape.
-        of_states: further arrays by name: `absorbing` is to be bool, the others of floats.
+        state_actions: (S, A), the reward's shape.
+        of_states: arrays `[S]` by name; `absorbing` has to be bool, the others floats.
 
     Raises:
-        ValueError: with the shapes.
-        TypeError: for other dtypes.
+        ValueError: for wrong shapes, with those expected.
+        TypeError: for wrong dtypes.
     """
     if isinstance(dynamics, SparseDynamics):
         shapes = (jnp.shape(dynamics.next_state), jnp.shape(dynamics.probability))
@@ -75,10 +75,10 @@ def check(dynamics: Dynamics, state_actions: tuple[int, ...], **of_states: Array
 
 
 def check_horizon(horizon: int | None) -> None:
-    """Refuse a horizon of no step.
+    """Check that a horizon, if there is one, is positive.
 
     Raises:
-        ValueError: with the horizon.
+        ValueError: if it is not.
     """
     if horizon is not None:
         checks.sizes(horizon=horizon)

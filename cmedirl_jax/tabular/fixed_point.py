@@ -13,10 +13,10 @@ class Stop(NamedTuple):
     """When an iteration ends.
 
     Attributes:
-        tolerance: greatest change of any entry at the last iteration, relative to the greatest
-            entry (or to 1, if that is less). What is left to go is at most
-            discount / (1 - discount) times that.
-        iterations: at most so many.
+        tolerance: largest change of an entry at the last iteration, relative to the largest entry
+            (or to 1, if that is larger). The remaining error is at most discount / (1 - discount)
+            times that.
+        iterations: largest number of iterations.
     """
 
     tolerance: Numeric = 1e-6
@@ -26,7 +26,7 @@ class Stop(NamedTuple):
 def iterate(
     function: Callable[[jax.Array], jax.Array], guess: jax.Array, stop: Stop
 ) -> tuple[jax.Array, jax.Array]:
-    """Apply `function` until it changes nothing more: the point, and the last (relative) change."""
+    """Apply `function` `[...]` -> `[...]` until `stop`: the point, and the last relative change."""
 
     def going(carry):
         _, change, count = carry
@@ -46,7 +46,7 @@ def iterate(
 def solve(
     function: Callable[[jax.Array], jax.Array], guess: jax.Array, stop: Stop
 ) -> tuple[jax.Array, jax.Array]:
-    """Like `iterate`, with derivatives of the point by whatever `function` closes over."""
+    """Like `iterate`, and differentiable by what `function` closes over."""
 
     def tangent(linear: Callable[[jax.Array], jax.Array], value: jax.Array) -> jax.Array:
         # `linear` is I - dF: its inverse is the fixed point of x -> value + dF x.

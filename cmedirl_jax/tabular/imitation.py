@@ -1,14 +1,14 @@
 """Maximum-entropy IRL for a continuous task, by dynamic programming on a grid.
 
     mdp = imitation.discretised(env, settings)
-    found = imitation.fit(key, mdp, env.spec, hot_start.data(pool), kind="linear")
-    act = discretise.greedy(mdp, found.policy.action_values)
+    result = imitation.fit(key, mdp, env.spec, hot_start.data(pool), kind="linear")
+    act = discretise.greedy(mdp, result.policy.action_values)
 
-This is "the original Maximum Entropy IRL" that the paper compares with, and its deep form: they
-need the model, which is the environment's own dynamics on a grid, and never act in the environment.
+This is "the original Maximum Entropy IRL" that the paper compares with, and its deep form. Both
+need a model, the environment's own dynamics on a grid, and never act in the environment.
 
-A grid's dynamics are not those that the demonstrations followed, so mu_D - E[mu] does not vanish
-anywhere and the likelihood of Eq. 4 has no maximum: the prior and the number of steps hold the
+The demonstrations followed other dynamics than the grid's. No reward therefore makes mu_D - E[mu]
+zero, and the likelihood of Eq. 4 has no maximum: the prior and the number of steps limit the
 reward's scale.
 """
 
@@ -42,17 +42,18 @@ class TabularSettings:
     Attributes:
         states: Points along each dimension of the observation.
         actions: Points along each dimension of the action.
-        subsamples: Transitions averaged for each state, along each dimension.
-        discount: Discount of the soft-optimal policy and of both visitations.
-        temperature: Temperature alpha of the soft-optimal policy.
-        reward: Whether the reward is of pairs or of states alone.
+        subsamples: Transitions averaged for each state, along each dimension of the observation.
+        discount: Discount of the soft-optimal policy and of both visitations, per environment step.
+        temperature: Temperature alpha of the soft-optimal policy, in units of the reward.
+        reward: r(s, a), or r(s).
         prior_precision: Precision of the Gaussian prior on theta, against the log-likelihood of one
             demonstration.
         steps: Steps of Adam.
-        centres: Radial basis functions along each dimension of the observation, of a linear reward.
-        hidden: Units of each hidden layer, of a deep reward.
-        linear_learning_rate: Adam's rate for a linear reward.
-        deep_learning_rate: Adam's rate for a deep reward.
+        centres: Radial basis functions along each dimension of the observation, for a linear
+            reward.
+        hidden: Units of each hidden layer, for a deep reward.
+        linear_learning_rate: Adam's rate for a linear reward, per step.
+        deep_learning_rate: Adam's rate for a deep reward, per step.
     """
 
     states: AtLeastTwo = 41
@@ -75,7 +76,7 @@ def discretised(
     """The environment on the settings' grid; `params` default to the environment's.
 
     Raises:
-        ValueError: if `discretise.make` cannot do that.
+        ValueError: what `discretise.make` raises.
     """
     settings = settings or TabularSettings()
     states, actions = grids(env.spec, settings)
@@ -105,16 +106,16 @@ def fit(
 ) -> MaxEntResult:
     """Fit a linear (Ziebart et al. 2008) or deep (Wulfmeier et al. 2015) reward.
 
-    Under `vmap` the seeds are fitted one after another: a processor gathers from many tables at
-    once four times as slowly, and no seed waits for another's fixed points.
+    Under `vmap` the seeds are fitted one after another. Gathering from many tables at once is four
+    times as slow on a CPU, and no seed has to wait for another's fixed points.
 
     Args:
-        key: of a deep reward's first parameters.
+        key: randomness of a deep reward's first parameters.
         mdp: the environment on a grid; pass it through `jit` rather than close over it.
         spec: the environment's sizes and bounds.
         data: the pool of demonstrations.
         subset: which of them; default all.
-        kind: of the reward.
+        kind: "linear" or "deep".
         settings: every other choice.
     """
     fit_one = functools.partial(_fit, spec=spec, kind=kind, settings=settings or TabularSettings())
@@ -132,19 +133,8 @@ def _fit(
     settings: TabularSettings,
 ) -> MaxEntResult:
     demonstrations = visitation(mdp, data, subset, discount=settings.discount)
-    states, actions = interpolation.points(mdp.states), interpolation.points(mdp.actions)
-    # The absorbing state has no place: whatever reward its row gets, nothing earns it.
-    observation = np.append(states, np.zeros_like(states[:1]), axis=0)
-    if settings.reward == "state":
-        inputs = (observation, np.zeros((len(observation), spec.action_dim), np.float32))
-    else:
-        pairs = (len(observation), len(actions))
-        inputs = (
-            np.broadcast_to(observation[:, None], (*pairs, spec.observation_dim)),
-            np.broadcast_to(actions, (*pairs, spec.action_dim)),
-        )
-    # Kept from the compiler, which would evaluate all that follows from constants.
-    inputs = jax.lax.optimization_barrier(jax.tree.map(jnp.asarray, inputs))
+    # The barrier keeps the compiler from evaluating the rest as constants.
+    inputs = jax.lax.optimization_barrier(jax.tree.map(jnp.asarray, _inputs(mdp, spec, settings)))
     linear = kind == "linear"
     rate = settings.linear_learning_rate if linear else settings.deep_learning_rate
     shared = {
@@ -162,6 +152,22 @@ def _fit(
     return maxent.deep_maxent_irl(key, network, inputs, mdp.dynamics, demonstrations, **shared)
 
 
+def _inputs(
+    mdp: FiniteMDP, spec: EnvSpec, settings: TabularSettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Observations and actions of the reward: `[S, O]`, `[S, A]`, or of pairs `[S, P, ...]`."""
+    states, actions = interpolation.points(mdp.states), interpolation.points(mdp.actions)
+    # The absorbing state has no place on the grid. Its row's reward is never earned.
+    observation = np.append(states, np.zeros_like(states[:1]), axis=0)
+    if settings.reward == "state":
+        return observation, np.zeros((len(observation), spec.action_dim), np.float32)
+    pairs = (len(observation), len(actions))
+    return (
+        np.broadcast_to(observation[:, None], (*pairs, spec.observation_dim)),
+        np.broadcast_to(actions, (*pairs, spec.action_dim)),
+    )
+
+
 def visitation(
     mdp: FiniteMDP,
     data: HotStartData,
@@ -169,13 +175,13 @@ def visitation(
     *,
     discount: Numeric,
 ) -> TabularDemonstrations:
-    """mu_D and D_0 of continuous demonstrations, each step shared among the grid's neighbours.
+    """mu_D and D_0 of continuous demonstrations; each step is shared among neighbouring points.
 
     Args:
-        mdp: whose grids.
+        mdp: the grids.
         data: the pool.
         subset: which of its demonstrations; default all.
-        discount: gamma.
+        discount: gamma, per environment step.
     """
     pool = jax.tree.map(jnp.asarray, data.episodes)
     chosen = pool if subset is None else subset

@@ -14,7 +14,7 @@ from cmedirl_jax.types import Array
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """Evenly spaced points, the box's bounds included. Static: it may be closed over or hashed.
+    """Evenly spaced points of a box, its bounds included. Static and hashable.
 
     Attributes:
         low: lower bound of each of the `D` dimensions.
@@ -38,12 +38,12 @@ class Grid:
 
     @property
     def size(self) -> int:
-        """Points in all."""
+        """The number of points."""
         return math.prod(self.shape)
 
     @property
     def spacing(self) -> np.ndarray:
-        """Distance of neighbours along each dimension, `[D]`."""
+        """The distance between neighbours along each dimension, `[D]`."""
         return (np.array(self.high) - self.low) / (np.array(self.shape) - 1)
 
 
@@ -54,10 +54,10 @@ def points(grid: Grid) -> np.ndarray:
 
 
 def interpolate(grid: Grid, position: Array) -> tuple[jax.Array, jax.Array]:
-    """Neighbouring points and their weights; positions outside the box count as on its border.
+    """Neighbouring points and their weights. Positions outside the box are moved to its border.
 
     Args:
-        grid: of `D` dimensions.
+        grid: a grid of `D` dimensions.
         position: `[..., D]`.
 
     Returns:

@@ -1,16 +1,17 @@
 """Maximum-entropy IRL with a model: linear (Ziebart et al. 2008), deep (Wulfmeier et al. 2015).
 
     demonstrations = empirical_visitation(state, action, mask, (S, A), discount=0.99)
-    found = maxent_irl(dynamics, features, demonstrations, discount=0.99)
-    found.reward, found.policy
+    result = maxent_irl(dynamics, features, demonstrations, discount=0.99)
+    result.reward, result.policy
 
-The reward maximises L = log P(D | r) + log P(theta) (Eq. 4). Its gradient is the difference in
-visitation, mu_D - E[mu], passed back through the reward (Eqs. 6, 8 and 9), plus that of the
-Gaussian log prior (Eq. 5). A reward of states alone, `[S]`, sees that difference summed over the
-actions, as the paper writes it.
+The reward maximises L = log P(D | r) + log P(theta) (Eq. 4). The gradient of L is the difference in
+visitation, mu_D - E[mu], passed back through the reward (Eqs. 6, 8 and 9), plus the gradient of the
+Gaussian log prior (Eq. 5). For a reward of states alone, `[S]`, that difference is summed over the
+actions, as in the paper.
 """
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ from cmedirl_jax.types import Array, Network, Numeric, Params
 
 
 class TabularDemonstrations(NamedTuple):
-    """What maximum-entropy IRL reads of the demonstrations.
+    """The visits and the starts of the demonstrations.
 
     Attributes:
         visitation: `[S, A]`, mu_D(s, a) = 1/N sum_i sum_t gamma^t 1[(s_t, a_t) = (s, a)].
@@ -38,12 +39,12 @@ class TabularDemonstrations(NamedTuple):
 
 
 class MaxEntInfo(NamedTuple):
-    """Diagnostics of each step, before it.
+    """Diagnostics of each step, of the parameters before it.
 
     Attributes:
-        log_likelihood: `[steps]`, (mu_D . r - sum_s D_0(s) V_0(s)) / alpha: the demonstrations'
-            discounted causal log-likelihood where the dynamics are deterministic, else its
-            expectation over the dynamics.
+        log_likelihood: `[steps]`, (mu_D . r - sum_s D_0(s) V_0(s)) / alpha. With deterministic
+            dynamics it is the demonstrations' discounted causal log-likelihood, otherwise the
+            expectation of that over the dynamics.
         log_prior: `[steps]`, -(lambda / 2) ||theta||^2.
         visitation_error: `[steps]`, sum_{s,a} |mu_D - E[mu]|.
         residual: `[steps]`, see `SoftPolicy`.
@@ -63,7 +64,7 @@ class MaxEntResult(NamedTuple):
         reward: `[S, A]`.
         policy: soft-optimal for that reward.
         visitation: `[S, A]`, E[mu] of that policy.
-        info: of every step.
+        info: diagnostics of every step.
     """
 
     params: Params
@@ -87,25 +88,25 @@ def maxent_irl(
     steps: int = 50,
     stop: Stop | None = None,
 ) -> MaxEntResult:
-    """Fit r = theta^T phi (Eq. 1) from theta = 0. Concave in theta: any optimum is the optimum.
+    """Fit r = theta^T phi (Eq. 1) from theta = 0. L is concave in theta: any maximum is global.
 
     Args:
         dynamics: P(s'|s,a).
         features: phi, `[S, F]` for a reward of states or `[S, A, F]`.
         demonstrations: their visitation, at the same discount.
-        discount: gamma.
-        horizon: steps of an episode, or None.
+        discount: gamma, per step.
+        horizon: steps of an episode; None: no limit.
         temperature: alpha of the soft-optimal policy.
-        absorbing: `[S]` bool, where the episode is over.
+        absorbing: `[S]` bool, the states in which an episode is over.
         prior_precision: lambda of the Gaussian prior on theta.
-        optimizer: any optax one; it descends the negative posterior. Default L-BFGS, which
-            searches along lines.
-        steps: of the optimiser.
-        stop: of the fixed points, without a horizon.
+        optimizer: an optax optimiser, which descends the negative posterior. Default: L-BFGS with
+            its line search.
+        steps: steps of the optimiser.
+        stop: when the fixed points' iterations end, if there is no horizon.
 
     Raises:
         ValueError: if the shapes do not fit each other, or a size is not positive.
-        TypeError: for other dtypes.
+        TypeError: for wrong dtypes.
     """
     features, size = jnp.asarray(features), jnp.shape(demonstrations.visitation)
     checks.kind("features", features, jnp.floating)
@@ -154,94 +155,133 @@ def deep_maxent_irl(
     """Fit r = g(f, theta), a network of every state (and action).
 
     Args:
-        key: of the network's first parameters.
+        key: randomness of the network's first parameters.
         network: `apply(params, *inputs)` gives `[S]` for a reward of states, or `[S, A]`.
         inputs: `(f [S, ...],)`, or `(f [S, A, ...], a [S, A, ...])`.
-        dynamics: and all that follows as in `maxent_irl`; the default optimiser is Adam at 0.01.
+        dynamics: this and the rest as in `maxent_irl`; the default optimiser is Adam at 0.01.
 
     Raises:
         ValueError: if the shapes do not fit each other, or a size is not positive.
-        TypeError: for other dtypes.
+        TypeError: for wrong dtypes.
     """
     checks.sizes(steps=steps)
-    tx = optax.with_extra_args_support(optimizer or optax.adam(0.01))
     visited, initial = demonstrations
     dynamics_lib.check(dynamics, jnp.shape(visited), initial=initial, absorbing=absorbing)
     checks.kind("visitation", visited, jnp.floating)
-    shared = {
-        "discount": discount,
-        "horizon": horizon,
-        "absorbing": absorbing,
-        "stop": stop,
-    }
+    problem = _Problem(
+        network=network,
+        inputs=inputs,
+        dynamics=dynamics,
+        demonstrations=demonstrations,
+        temperature=temperature,
+        prior_precision=prior_precision,
+        control={"discount": discount, "horizon": horizon, "absorbing": absorbing, "stop": stop},
+        optimizer=optax.with_extra_args_support(optimizer or optax.adam(0.01)),
+    )
 
-    def of_pairs(params: Params) -> jax.Array:
-        reward = network.apply(params, *inputs)
-        if reward.shape == visited.shape[:1]:
-            reward = reward[:, None]
-        elif reward.shape != visited.shape:
-            raise ValueError(
-                f"a reward of states is {visited.shape[:1]}, or of pairs {visited.shape}, "
-                f"got {reward.shape}"
-            )
-        return jnp.broadcast_to(reward, visited.shape)
-
-    def solve(reward: jax.Array, guess: jax.Array) -> SoftPolicy:
-        return soft_control.soft_value_iteration(
-            dynamics, reward, temperature=temperature, guess=guess, **shared
-        )
-
-    def log_likelihood(reward: jax.Array, policy: SoftPolicy) -> jax.Array:
-        first = policy.values if horizon is None else policy.values[0]
-        return (jnp.sum(visited * reward) - initial @ first) / temperature
-
-    def log_prior(params: Params) -> jax.Array:
-        return -0.5 * prior_precision * optax.tree.norm(params, squared=True)
-
-    def visits(policy: SoftPolicy, guess: jax.Array) -> jax.Array:
-        return soft_control.expected_visitation(dynamics, policy, initial, guess=guess, **shared)
-
-    def step(carry, _: None):
-        params, state, values, occupancy = carry
-        reward, backward = jax.vjp(of_pairs, params)
-        policy = solve(reward, values)
-        expected = visits(policy, occupancy)
-        difference = visited - expected
-        # Eq. 9 with a loss's sign: the difference in visitation is the error signal.
-        (gradient,) = backward(-difference / temperature)
-        gradient = jax.tree.map(lambda g, theta: g + prior_precision * theta, gradient, params)
-
-        def loss(params: Params) -> jax.Array:
-            reward = of_pairs(params)
-            return -log_likelihood(reward, solve(reward, values)) - log_prior(params)
-
-        info = MaxEntInfo(
-            log_likelihood(reward, policy),
-            log_prior(params),
-            jnp.sum(jnp.abs(difference)),
-            policy.residual,
-        )
-        updates, state = tx.update(
-            gradient,
-            state,
-            params,
-            # For those that search along a line.
-            value=-info.log_likelihood - info.log_prior,
-            grad=gradient,
-            value_fn=loss,
-        )
-        params = optax.apply_updates(params, updates)
-        if horizon is None:
-            values, occupancy = policy.values, jnp.sum(expected, axis=1)
-        return (params, state, values, occupancy), info
-
-    # Fixed points are looked for where the last ones were found.
+    # Each step's fixed points start where those of the step before ended.
     params = network.init(key)
-    start = (params, tx.init(params), jnp.zeros_like(initial), initial)
-    (params, _, values, occupancy), info = jax.lax.scan(step, start, None, length=steps)
-    reward = of_pairs(params)
-    policy = solve(reward, values)
-    return MaxEntResult(params, reward, policy, visits(policy, occupancy), info)
+    start = (params, problem.optimizer.init(params), jnp.zeros_like(initial), initial)
+    (params, _, values, occupancy), info = jax.lax.scan(
+        functools.partial(_step, problem), start, None, length=steps
+    )
+    reward = _reward(problem, params)
+    policy = _soft_policy(problem, reward, values)
+    return MaxEntResult(params, reward, policy, _visitation(problem, policy, occupancy), info)
+
+
+class _Problem(NamedTuple):
+    """What every step reads; the arguments of `deep_maxent_irl`.
+
+    `control` holds the keyword arguments that both functions of `soft_control` take.
+    """
+
+    network: Network
+    inputs: tuple[Array, ...]
+    dynamics: Dynamics
+    demonstrations: TabularDemonstrations
+    temperature: Numeric
+    prior_precision: Numeric
+    control: dict[str, Any]
+    optimizer: optax.GradientTransformationExtraArgs
+
+
+def _step(
+    problem: _Problem, carry: tuple[Any, optax.OptState, jax.Array, jax.Array], _: None
+) -> tuple[tuple[Any, optax.OptState, jax.Array, jax.Array], MaxEntInfo]:
+    """Take a step of the optimiser. The carry: theta, the optimiser's state, V and visits `[S]`."""
+    # The policy that is optimal for the reward, and what it visits.
+    params, state, values, occupancy = carry
+    reward, backward = jax.vjp(functools.partial(_reward, problem), params)
+    policy = _soft_policy(problem, reward, values)
+    expected = _visitation(problem, policy, occupancy)
+
+    # Eq. 9 with the sign of a loss: the difference in visitation is the error signal.
+    difference = problem.demonstrations.visitation - expected
+    (gradient,) = backward(-difference / problem.temperature)
+    gradient = jax.tree.map(lambda g, theta: g + problem.prior_precision * theta, gradient, params)
+    info = MaxEntInfo(
+        _log_likelihood(problem, reward, policy),
+        _log_prior(problem, params),
+        jnp.sum(jnp.abs(difference)),
+        policy.residual,
+    )
+
+    updates, state = problem.optimizer.update(
+        gradient,
+        state,
+        params,
+        # For optimisers that search along a line.
+        value=-info.log_likelihood - info.log_prior,
+        grad=gradient,
+        value_fn=functools.partial(_negative_posterior, problem, values),
+    )
+    params = optax.apply_updates(params, updates)
+    if problem.control["horizon"] is None:
+        values, occupancy = policy.values, jnp.sum(expected, axis=1)
+    return (params, state, values, occupancy), info
+
+
+def _reward(problem: _Problem, params: Params) -> jax.Array:
+    """The network's reward of every pair, `[S, A]`."""
+    reward, size = problem.network.apply(params, *problem.inputs), problem.demonstrations[0].shape
+    if reward.shape == size[:1]:
+        reward = reward[:, None]
+    elif reward.shape != size:
+        raise ValueError(
+            f"a reward of states is {size[:1]}, or of pairs {size}, got {reward.shape}"
+        )
+    return jnp.broadcast_to(reward, size)
+
+
+def _soft_policy(problem: _Problem, reward: jax.Array, guess: jax.Array) -> SoftPolicy:
+    return soft_control.soft_value_iteration(
+        problem.dynamics, reward, temperature=problem.temperature, guess=guess, **problem.control
+    )
+
+
+def _visitation(problem: _Problem, policy: SoftPolicy, guess: jax.Array) -> jax.Array:
+    initial = problem.demonstrations.initial
+    return soft_control.expected_visitation(
+        problem.dynamics, policy, initial, guess=guess, **problem.control
+    )
+
+
+def _log_likelihood(problem: _Problem, reward: jax.Array, policy: SoftPolicy) -> jax.Array:
+    visited, initial = problem.demonstrations
+    first = policy.values if problem.control["horizon"] is None else policy.values[0]
+    return (jnp.sum(visited * reward) - initial @ first) / problem.temperature
+
+
+def _log_prior(problem: _Problem, params: Params) -> jax.Array:
+    return -0.5 * problem.prior_precision * optax.tree.norm(params, squared=True)
+
+
+def _negative_posterior(problem: _Problem, guess: jax.Array, params: Params) -> jax.Array:
+    """The loss `[]` at other parameters; `guess` is where the values' iteration begins."""
+    reward = _reward(problem, params)
+    policy = _soft_policy(problem, reward, guess)
+    return -_log_likelihood(problem, reward, policy) - _log_prior(problem, params)
 
 
 def empirical_visitation(
@@ -249,15 +289,15 @@ def empirical_visitation(
 ) -> TabularDemonstrations:
     """Count demonstrations: mu_D and D_0.
 
-    Without a horizon they have to end in absorbing states: one that is cut off after T steps adds
-    an error of the order of gamma^T to the gradient.
+    Without a horizon the demonstrations have to end in absorbing states. One that is cut off after
+    T steps adds an error of the order of gamma^T to the gradient.
 
     Args:
         state: `[N, T]` int.
         action: `[N, T]` int.
         mask: `[N, T]` bool, False past a demonstration's end; its first step is never past it.
         size: (S, A).
-        discount: gamma.
+        discount: gamma, per step.
     """
     mask = jnp.asarray(mask)
     weight = mask * jnp.asarray(discount) ** jnp.arange(mask.shape[1]) / mask.shape[0]

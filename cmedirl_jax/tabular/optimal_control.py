@@ -1,4 +1,4 @@
-"""Optimal control of a finite Markov decision process: what no policy can exceed."""
+"""Optimal control of a finite Markov decision process: the largest return of any policy."""
 
 from typing import NamedTuple
 
@@ -14,13 +14,13 @@ from cmedirl_jax.types import Array, Numeric
 
 
 class OptimalPolicy(NamedTuple):
-    """The optimum.
+    """Optimal values.
 
     Attributes:
         values: `[T, S]`, V*_t(s) with T - t steps to go; `[S]` for an infinite horizon.
-        action_values: `[S, A]`, Q* at the first step. Those of later steps are left out for their
-            size; `expected_next` of the values gives them.
-        residual: `[]`, as in `SoftPolicy`.
+        action_values: `[S, A]`, Q* at the first step. Those of later steps would take `T` times the
+            memory; `expected_next` of the values gives them.
+        residual: `[]`, see `SoftPolicy`.
     """
 
     values: jax.Array
@@ -37,11 +37,13 @@ def value_iteration(
     absorbing: Array | None = None,
     stop: Stop | None = None,
 ) -> OptimalPolicy:
-    """V*(s) = max_a r(s, a) + gamma sum_s' P(s'|s,a) V*(s'); arguments as `soft_value_iteration`.
+    """V*(s) = max_a r(s, a) + gamma sum_s' P(s'|s,a) V*(s').
+
+    The arguments are those of `soft_value_iteration`.
 
     Raises:
         ValueError: if the shapes do not fit each other, or the horizon is below 1.
-        TypeError: for other dtypes.
+        TypeError: for wrong dtypes.
     """
     dynamics_lib.check(dynamics, jnp.shape(reward), absorbing=absorbing)
     checks.kind("reward", reward, jnp.floating)

@@ -3,11 +3,13 @@
     policy = soft_value_iteration(dynamics, reward, discount=0.99)
     visits = expected_visitation(dynamics, policy, initial, discount=0.99)
 
-Soft, not hard: V(s) = alpha log sum_a exp(Q(s, a) / alpha). With alpha = 1, deterministic dynamics
-and starts equal to the demonstrations', the derivative of the demonstrations' (discounted) causal
-log-likelihood by the reward is mu_D - E[mu] exactly; hard value iteration does not have that.
+The value is soft: V(s) = alpha log sum_a exp(Q(s, a) / alpha). With alpha = 1, deterministic
+dynamics and the demonstrations' starts, mu_D - E[mu] is exactly the derivative of the
+demonstrations' (discounted) causal log-likelihood by the reward. With hard value iteration it is
+not.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -22,14 +24,14 @@ from cmedirl_jax.types import Array, Numeric
 
 
 class SoftPolicy(NamedTuple):
-    """The soft-optimal policy. Without the axis `T` for an infinite horizon.
+    """The soft-optimal policy. For an infinite horizon there is no axis `T`.
 
     Attributes:
         log_probabilities: `[T, S, A]`, log pi_t(a|s) = (Q_t(s, a) - V_t(s)) / alpha.
         action_values: `[T, S, A]`, Q_t(s, a) = r(s, a) + gamma sum_s' P(s'|s,a) V_{t+1}(s').
         values: `[T, S]`, V_t(s) = alpha log sum_a exp(Q_t(s, a) / alpha); 0 where absorbing.
-        residual: `[]`, relative change at the last iteration; 0 for a finite horizon. Above the
-            tolerance only where the bound on iterations was met.
+        residual: `[]`, relative change at the last iteration; 0 for a finite horizon. It is above
+            the tolerance only if the limit on iterations was reached.
     """
 
     log_probabilities: jax.Array
@@ -49,21 +51,22 @@ def soft_value_iteration(
     stop: Stop | None = None,
     guess: jax.Array | None = None,
 ) -> SoftPolicy:
-    """Solve for the soft-optimal policy. Differentiable by the reward, also at the fixed point.
+    """Solve for the soft-optimal policy. It is differentiable by the reward.
 
     Args:
         dynamics: P(s'|s,a).
         reward: `[S, A]`.
-        discount: gamma; below 1 for an infinite horizon.
-        horizon: steps T of an episode, with V_T = 0; None for the fixed point.
+        discount: gamma, per step; below 1 for an infinite horizon.
+        horizon: steps T of an episode, with V_T = 0; None: infinite, by a fixed point.
         temperature: alpha, above 0.
-        absorbing: `[S]` bool, where the episode is over: no reward, no action, no entropy.
-        stop: of the fixed point's iteration.
-        guess: `[S]`, where that begins; default zeros.
+        absorbing: `[S]` bool, the states in which an episode is over: there is no reward, no action
+            and no entropy.
+        stop: when the fixed point's iteration ends.
+        guess: `[S]`, values at which that iteration begins; default zeros.
 
     Raises:
         ValueError: if the shapes do not fit each other, or the horizon is below 1.
-        TypeError: for other dtypes.
+        TypeError: for wrong dtypes.
     """
     dynamics_lib.check(dynamics, jnp.shape(reward), absorbing=absorbing, guess=guess)
     checks.kind("reward", reward, jnp.floating)
@@ -103,54 +106,68 @@ def expected_visitation(
 ) -> jax.Array:
     """E[mu](s, a) = sum_t gamma^t D_t(s) pi_t(a|s), `[S, A]` (Eq. 7, by dynamic programming).
 
-    D_{t+1}(s') = sum_{s,a} D_t(s) pi_t(a|s) P(s'|s,a). Nothing is visited once absorbed.
+    D_{t+1}(s') = sum_{s,a} D_t(s) pi_t(a|s) P(s'|s,a). Absorbing states count no visits.
 
     Args:
         dynamics: P(s'|s,a).
-        policy: as `soft_value_iteration` gave it for the same horizon.
+        policy: what `soft_value_iteration` gave for the same horizon.
         initial: `[S]`, the distribution of the first state.
-        discount: gamma.
-        horizon: steps T; None to sum until nothing is added any more.
-        absorbing: `[S]` bool.
-        stop: of the sum without a horizon.
-        guess: `[S]`, the discounted number of visits where its iteration begins.
+        discount: gamma, per step.
+        horizon: steps T of an episode; None: infinite, by a fixed point.
+        absorbing: `[S]` bool, the states in which an episode is over.
+        stop: when the fixed point's iteration ends.
+        guess: `[S]`, discounted visits at which that iteration begins; default `initial`.
 
     Raises:
-        ValueError: if the policy is not of that horizon, or the shapes do not fit each other.
-        TypeError: for other dtypes.
+        ValueError: if the policy is for another horizon, or the shapes do not fit each other.
+        TypeError: for wrong dtypes.
     """
     steps = () if horizon is None else (horizon,)
-    if policy.log_probabilities.shape != (*steps, *policy.log_probabilities.shape[-2:]):
+    size = policy.log_probabilities.shape[-2:]
+    if policy.log_probabilities.shape != (*steps, *size):
         raise ValueError(
             f"a policy of horizon {horizon} has log_probabilities {(*steps, 'S', 'A')}, "
             f"got {policy.log_probabilities.shape}"
         )
-    dynamics_lib.check(
-        dynamics,
-        policy.log_probabilities.shape[-2:],
-        initial=initial,
-        absorbing=absorbing,
-        guess=guess,
-    )
+    dynamics_lib.check(dynamics, size, initial=initial, absorbing=absorbing, guess=guess)
     probabilities = jnp.exp(policy.log_probabilities)
     if absorbing is not None:
         probabilities = jnp.where(jnp.asarray(absorbing)[:, None], 0.0, probabilities)
+
+    # Infinite horizon: the discounted visits of each state are a fixed point.
     if horizon is None:
-
-        def extend(visits: jax.Array) -> jax.Array:
-            moved = dynamics_lib.next_distribution(dynamics, visits[:, None] * probabilities)
-            return initial + discount * moved
-
+        extend = functools.partial(_extend, dynamics, probabilities, initial, discount)
         guess = initial if guess is None else guess
         visits, _ = fixed_point.solve(extend, guess, stop or Stop())
         return visits[:, None] * probabilities
 
-    def body(carry, probabilities: jax.Array):
-        distribution, weight, total = carry
-        visits = distribution[:, None] * probabilities
-        moved = dynamics_lib.next_distribution(dynamics, visits)
-        return (moved, weight * discount, total + weight * visits), None
-
+    # Finite horizon: forward in time, adding up.
+    move = functools.partial(_move, dynamics, discount)
     carry = (initial, jnp.ones_like(initial[0]), jnp.zeros_like(probabilities[0]))
-    (_, _, total), _ = jax.lax.scan(body, carry, probabilities)
+    (_, _, total), _ = jax.lax.scan(move, carry, probabilities)
     return total
+
+
+def _extend(
+    dynamics: Dynamics,
+    probabilities: jax.Array,
+    initial: jax.Array,
+    discount: Numeric,
+    visits: jax.Array,
+) -> jax.Array:
+    """D_0 + gamma P^T (d pi) of discounted visits d, `[S]` -> `[S]`."""
+    moved = dynamics_lib.next_distribution(dynamics, visits[:, None] * probabilities)
+    return initial + discount * moved
+
+
+def _move(
+    dynamics: Dynamics,
+    discount: Numeric,
+    carry: tuple[jax.Array, jax.Array, jax.Array],
+    probabilities: jax.Array,
+) -> tuple[tuple[jax.Array, jax.Array, jax.Array], None]:
+    """Move by one step. The carry: D_t `[S]`, gamma^t `[]`, and the sum so far `[S, A]`."""
+    distribution, weight, total = carry
+    visits = distribution[:, None] * probabilities
+    moved = dynamics_lib.next_distribution(dynamics, visits)
+    return (moved, weight * discount, total + weight * visits), None

@@ -1,5 +1,7 @@
 """A reward that was learned on a grid, as r_D for an agent in the continuous task (Eq. 10)."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
@@ -11,39 +13,45 @@ from cmedirl_jax.tabular.interpolation import Grid
 
 
 def make(states: Grid, actions: Grid, hparams: IRLHParams | None = None) -> RewardLearner:
-    """A `RewardLearner` that learns nothing: its reward is a table, interpolated.
+    """Make a `RewardLearner` that learns nothing: its reward interpolates a table.
 
     Args:
         states: grid of the observations.
         actions: grid of the actions.
-        hparams: of which only `bound` is read.
+        hparams: only `bound` is read.
     """
-    hparams = hparams or IRLHParams()
+    return RewardLearner(
+        init=functools.partial(_init, states, actions, hparams or IRLHParams()),
+        reward=functools.partial(_reward, states, actions),
+        update=base.learn_nothing,
+    )
 
-    def init(key: jax.Array) -> RewardState:
-        del key
-        return state(jnp.zeros((states.size, actions.size)), hparams)
 
-    def reward(state: RewardState, observation: jax.Array, action: jax.Array) -> jax.Array:
-        checks.shape("observation", observation, (*observation.shape[:-1], len(states.shape)))
-        checks.shape("action", action, (*observation.shape[:-1], len(actions.shape)))
-        row, row_weight = interpolation.interpolate(states, observation)
-        column, column_weight = interpolation.interpolate(actions, action)
-        values = state.params[row[..., :, None], column[..., None, :]]
-        return jnp.einsum("...rc,...r,...c->...", values, row_weight, column_weight)
+def _init(states: Grid, actions: Grid, hparams: IRLHParams, key: jax.Array) -> RewardState:
+    del key
+    return state(jnp.zeros((states.size, actions.size)), hparams)
 
-    return RewardLearner(init, reward, base.learn_nothing)
+
+def _reward(
+    states: Grid, actions: Grid, state: RewardState, observation: jax.Array, action: jax.Array
+) -> jax.Array:
+    checks.shape("observation", observation, (*observation.shape[:-1], len(states.shape)))
+    checks.shape("action", action, (*observation.shape[:-1], len(actions.shape)))
+    row, row_weight = interpolation.interpolate(states, observation)
+    column, column_weight = interpolation.interpolate(actions, action)
+    values = state.params[row[..., :, None], column[..., None, :]]
+    return jnp.einsum("...rc,...r,...c->...", values, row_weight, column_weight)
 
 
 def state(table: jax.Array, hparams: IRLHParams) -> RewardState:
     """The state that holds `table`, scaled so that its largest magnitude is the bound.
 
-    The scale of a reward that explains demonstrations is arbitrary, and one that is large next to
-    the environment's makes loitering better than finishing.
+    Demonstrations do not determine the scale of a reward. A reward that is large beside the
+    environment's makes staying alive better than finishing.
 
     Args:
         table: `[states.size, actions.size]`, without a row for the absorbing state.
-        hparams: whose `bound`.
+        hparams: only `bound` is read.
     """
     largest = jnp.max(jnp.abs(table))
     scaled = hparams.bound * table / jnp.where(largest > 0, largest, 1.0)
