@@ -1,4 +1,45 @@
-"""Continuous maximum-entropy deep inverse reinforcement learning with hot-started DDPG, in JAX."""
+"""Continuous maximum-entropy deep inverse reinforcement learning with hot-started DDPG, in JAX.
+
+Learn a reward from demonstrations, and train on it:
+
+    import cmedirl_jax as cm
+
+    env = cm.envs.make("MountainCarContinuous-v0")
+    pool = cm.demonstrations.load("pool.npz", env.spec)
+    method = cm.METHODS["hs-me-ddpg"]
+    result = cm.training.fit(key, env, method, pool, seeds=8, steps=12_000)
+
+Everything is a pure function over pytrees: the caller owns jit, vmap, donation and sharding.
+
+Tasks and data
+    envs: environments by name, their interface, and your own.
+    demonstrations: a pool of trajectories, its file, each learner's subset, and sampling.
+    replay, episodes: the replay buffer, and where the latest episodes lie in it.
+
+The agent
+    networks: the actor and the critic.
+    ddpg: deep deterministic policy gradient.
+    exploration: behaviour policies and their densities.
+    hot_start: the hot start of actor and critic from demonstrations (Eq. 11).
+
+The reward
+    irl: learns r_D from samples (Algorithm 1), with objectives, regularisers, GAIL and controls.
+    rewards: networks for r_D.
+    shaping: how r_D joins the environment's reward (Eq. 10).
+    background: the samples that r_D is learned from.
+    tabular: maximum-entropy IRL and control with a model (Eqs. 1 and 4-9).
+
+Training
+    METHODS, Method, Settings: the methods by name, and every choice that they share.
+    training: Algorithm 2, for one seed or many.
+    schedules: what happens at which step.
+    seeds: many seeds in one program, on several devices.
+    evaluation: noise-free returns.
+    checkpoint: pytrees on disk.
+
+Types
+    EnvSpec, Transition, RewardBatch, Network.
+"""
 
 from cmedirl_jax import envs, irl, networks, tabular, training
 from cmedirl_jax.agents import ddpg, exploration, hot_start

@@ -159,7 +159,7 @@ def critic_loss(
     """The loss `[]` that `hparams.critic` names (see above), and the parameters.
 
     Args:
-        networks: whose critic.
+        networks: the critic, and the sizes and bounds of the environment.
         critic: its parameters.
         hparams: which loss, how many cells, the curvature, the margin.
         observation: `[B, O]`.

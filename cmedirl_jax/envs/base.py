@@ -1,4 +1,4 @@
-"""The environment interface: two pure functions, in the manner of gymnax."""
+"""The environment interface: pure functions, after gymnax, and their check."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol

@@ -122,8 +122,8 @@ def _apply_to_states(
 def linear(spec: EnvSpec, features: Features) -> Network:
     """theta^T phi (Eq. 1): observation `[..., O]`, action `[..., A]` -> `[...]`; theta is `[F]`.
 
-    It starts from theta = 0 and ignores the key: there is no symmetry to break, and a reward of zero
-    has no preference. Without a bound the likelihood is concave in theta.
+    It starts from theta = 0 and ignores the key: there is no symmetry to break, and a reward of
+    zero has no preference. Without a bound the likelihood is concave in theta.
     """
     size = jax.eval_shape(features, spec.observation_low, spec.action_low).shape[-1]
     return Network(
