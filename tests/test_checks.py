@@ -24,7 +24,7 @@ def transition(spec, *leading):
 
 
 @pytest.mark.parametrize("leading", [(), (4,), (3, 5)])
-def test_leaves_of_the_specs_sizes_pass(skewed_spec, leading):
+def test_transitions_of_the_specs_sizes_pass(skewed_spec, leading):
     checks.transition_shapes(skewed_spec, transition(skewed_spec, *leading), leading, "batch")
 
 
@@ -73,7 +73,7 @@ def test_a_specification_that_contradicts_itself_is_refused(skewed_spec, change,
         compose.compose(wrong, METHODS["ddpg"], Settings(), capacity=10)
 
 
-def test_observations_without_bounds_agree_with_themselves(skewed_spec):
+def test_observations_may_be_unbounded(skewed_spec):
     infinite = np.full(3, np.inf)
     checks.env_spec(skewed_spec._replace(observation_low=-infinite, observation_high=infinite))
 
@@ -86,7 +86,7 @@ def abstract(function):
 
 
 def public_functions(spec):
-    """Of each public function that takes arrays: a call by their names, and right ones."""
+    """A call, by the arrays' names, and valid arrays for each public function that takes some."""
     agent, buffer = ddpg.make(spec), replay.make(spec, 10)
     learners = {
         "irl": irl.make(spec),
@@ -268,7 +268,7 @@ def tabular_functions():
             dynamics, features, demonstrations, discount=0.9, absorbing=absorbing, steps=1
         )
 
-    found = {
+    visited = {
         "visitation": jnp.zeros((STATES, ACTIONS)),
         "initial": jnp.full(STATES, 1 / STATES),
         "absorbing": of_states["absorbing"],
@@ -287,9 +287,15 @@ def tabular_functions():
             abstract(visits),
             dense
             | of_states
-            | {"log_probabilities": jnp.zeros((STATES, ACTIONS)), "initial": found["initial"]},
+            | {
+                "log_probabilities": jnp.zeros((STATES, ACTIONS)),
+                "initial": visited["initial"],
+            },
         ),
-        "maxent": (abstract(fit), dense | found | {"features": jnp.zeros((STATES, ACTIONS, 7))}),
+        "maxent": (
+            abstract(fit),
+            dense | visited | {"features": jnp.zeros((STATES, ACTIONS, 7))},
+        ),
     }
 
 
@@ -297,7 +303,7 @@ ANY_NUMBERS = (
     *("log_density", "discounted_return", "log_probabilities"),
     *("weight", "discount", "number"),
 )
-"""What may be integers as well as floats."""
+"""Arguments that may be integers as well as floats."""
 
 
 def takes_any_leading_axes(function):
@@ -305,7 +311,7 @@ def takes_any_leading_axes(function):
 
 
 def wrong_arrays(name, array):
-    """Arrays that are not `array`'s shape, or not its kind."""
+    """Arrays that have another shape than `array`, or another kind of dtype."""
     if array.ndim:
         yield array[0]
         yield jnp.concatenate([array, array[:1]])
@@ -315,7 +321,7 @@ def wrong_arrays(name, array):
         yield array.astype(jnp.float32 if not jnp.issubdtype(array.dtype, jnp.floating) else int)
 
 
-def test_public_functions_take_right_arrays_and_refuse_every_other_by_shape_or_dtype(skewed_spec):
+def test_public_functions_accept_valid_arrays_and_name_the_shape_or_dtype_of_others(skewed_spec):
     refusals = 0
     functions = public_functions(skewed_spec)
     for name, (call, right) in component_functions(skewed_spec).items():
@@ -349,7 +355,7 @@ def test_shapes_under_vmap_are_those_of_one_seed(skewed_spec):
 
 
 @pytest.mark.parametrize("size", ["cells", "steps", "batch_size"])
-def test_a_hot_start_of_no_size_is_refused(skewed_spec, size):
+def test_sizes_of_a_hot_start_are_positive(skewed_spec, size):
     networks = ddpg.make(skewed_spec).networks
     with pytest.raises(ValueError, match=f"{size} must be at least 1, got 0"):
         hot_start.fit(
@@ -358,7 +364,7 @@ def test_a_hot_start_of_no_size_is_refused(skewed_spec, size):
 
 
 @pytest.mark.parametrize("solve", [tabular.soft_value_iteration, tabular.value_iteration])
-def test_a_horizon_of_no_step_is_refused(solve):
+def test_a_horizon_of_zero_is_refused(solve):
     with pytest.raises(ValueError, match="horizon must be at least 1, got 0"):
         solve(np.full((2, 2, 2), 0.5), np.zeros((2, 2)), discount=1.0, horizon=0)
 
@@ -386,7 +392,7 @@ def test_positive_numbers_are_finite(wrong):
         checks.positive(scale=wrong)
 
 
-def test_values_that_are_traced_are_not_asked_for():
+def test_traced_values_pass():
     def check(number):
         checks.sizes(number=number)
         checks.shares(number=number)

@@ -1,3 +1,4 @@
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,7 @@ normalisations = pytest.mark.parametrize("normalisation", NORMALISATIONS)
 
 
 def randomised(variables):
-    """Variables whose every leaf matters: running variances positive, nothing zero or one."""
+    """Random variables; running variances are positive, and no entry is zero or one."""
     rng = np.random.default_rng(0)
     variables = jax.tree.map(lambda leaf: rng.normal(0.1, 0.7, leaf.shape), variables)
     for statistics in variables.get("batch_stats", {}).values():
@@ -22,7 +23,7 @@ def randomised(variables):
 
 
 def reference(variables, x, joined=None, *, normalisation, join=0, train=False):
-    """The perceptron in float64, and where its running statistics move to in training."""
+    """The perceptron in float64, and its running statistics after a training step."""
     params, moved = variables["params"], {}
     depth = sum(name.startswith("Dense") for name in params) - 1
     for index in range(depth):
@@ -143,12 +144,8 @@ def test_training_normalises_by_the_batch_and_moves_the_running_statistics(skewe
     )
     np.testing.assert_allclose(output, expected[:, 0], rtol=1e-4, atol=1e-4)
     assert set(moved) == {"params", "batch_stats"}
-    jax.tree.map(np.testing.assert_array_equal, moved["params"], variables["params"])
-    jax.tree.map(
-        lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6),
-        moved["batch_stats"],
-        expected_moved,
-    )
+    chex.assert_trees_all_equal(moved["params"], variables["params"])
+    chex.assert_trees_all_close(moved["batch_stats"], expected_moved, rtol=1e-4, atol=1e-6)
 
 
 @normalisations

@@ -1,3 +1,4 @@
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +25,7 @@ def test_adam_is_optax_adam_step_for_step():
     ours = trajectory(optimizers.adam(), learning_rate=3e-3)
     theirs = trajectory(optax.adam(3e-3))
     for actual, expected in zip(ours, theirs, strict=True):
-        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), actual, expected)
+        chex.assert_trees_all_close(actual, expected, rtol=1e-6)
 
 
 def test_learning_rates_can_be_vmapped_over():
@@ -36,14 +37,11 @@ def test_learning_rates_can_be_vmapped_over():
     batched = jax.vmap(last)(jnp.array(rates))
     for index, rate in enumerate(rates):
         *_, expected = trajectory(optax.adam(rate))
-        jax.tree.map(
-            lambda x, y, index=index: np.testing.assert_allclose(x[index], y, rtol=1e-5),
-            batched,
-            expected,
-        )
+        actual = jax.tree.map(lambda leaf, index=index: leaf[index], batched)
+        chex.assert_trees_all_close(actual, expected, rtol=1e-5)
 
 
-def test_hyperparameters_have_one_type_whoever_made_them():
+def test_traced_hyperparameters_are_float32():
     made = [optimizers.traced({"rate": value, "none": None}) for value in (1, 1.0, np.float64(1.0))]
     assert len({str(jax.tree.map(jnp.asarray, tree)) for tree in made}) == 1
     assert made[0]["rate"].dtype == jnp.float32

@@ -59,7 +59,7 @@ def test_a_range_is_found_in_optional_fields_and_in_tuples():
     ]
 
 
-def test_a_number_without_a_range_is_an_error_of_ours():
+def test_a_number_without_a_range_is_a_type_error():
     forgotten = dataclasses.make_dataclass("Forgotten", [("number", float)])
     with pytest.raises(TypeError, match="number has no range"):
         ranges.check(forgotten(1.0))
@@ -73,7 +73,7 @@ def test_what_32_bits_cannot_hold_is_out_of_range():
     assert wrong == "must be at most 2^31 - 1, got 2147483648"
 
 
-def test_composition_refuses_them_by_name(spec):
+def test_composition_names_numbers_out_of_range(spec):
     with pytest.raises(ValueError, match=r"^agent.tau must be above 0 and at most 1, got -1$"):
         compose.compose(spec, METHODS["ddpg"], with_tau(-1), capacity=10)
 

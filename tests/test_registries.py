@@ -14,7 +14,7 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
         registry["plum"]
 
 
-def test_an_entry_of_ones_own_is_found_and_listed():
+def test_an_added_entry_is_found_and_listed():
     registry = Registry("fruit", {})
     registry["apple"] = 1
     assert registry["apple"] == 1

@@ -25,7 +25,7 @@ def test_only_a_network_with_running_statistics_has_a_third_function():
     assert Network(init=jnp.zeros, apply=jnp.add).train is None
 
 
-def test_a_batch_is_a_pytree_that_maps_whole():
+def test_a_reward_batch_is_a_pytree():
     transition = Transition(jnp.ones((3, 2)), *(jnp.ones((3, 1)) for _ in range(4)))
     batch = RewardBatch(transition, jnp.zeros(3), jnp.ones(3, bool))
     first = jax.vmap(lambda batch: batch)(batch)

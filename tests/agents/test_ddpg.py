@@ -42,7 +42,7 @@ def test_gradients_equal_finite_differences_of_a_float64_reference(q_filter):
         DDPGHParams(pre_activation_penalty=0.1, behaviour_cloning=0.7, q_filter=q_filter)
     )
     before = agent.init(jax.random.key(0))
-    # Targets apart from the parameters, or an exchange of the two would go unseen.
+    # Targets that differ from the parameters, so that exchanging the two would be noticed.
     target = agent.init(jax.random.key(1))
     before = before.replace(target_actor=target.actor, target_critic=target.critic)
     batch, demonstrations = random_batch(jax.random.key(2), 16), random_batch(jax.random.key(3), 6)
@@ -227,7 +227,7 @@ def test_batch_normalised_networks_train_and_move_their_statistics():
     for name in ("actor", "critic"):
         old, new = (getattr(state, name)["batch_stats"] for state in (before, after))
         assert all(jax.tree.leaves(jax.tree.map(lambda a, b: bool((a != b).any()), old, new)))
-    # The demonstrations' term is no reason to fit running statistics by gradient.
+    # The behaviour-cloning term must not move running statistics.
     cloned, _ = jax.jit(agent.update)(before, batch, random_batch(jax.random.key(2), 8))
     chex.assert_trees_all_close(
         cloned.actor["batch_stats"], after.actor["batch_stats"], rtol=1e-5, atol=1e-7

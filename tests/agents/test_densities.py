@@ -35,10 +35,10 @@ def test_a_clipped_normals_density_is_scipys():
 
 
 def test_a_distant_bound_keeps_its_density():
-    found = clipped_normal(np.float32([-0.9, 0.55]), np.float32([0.1, 0.02]), ACTIONS)
+    log_density = clipped_normal(np.float32([-0.9, 0.55]), np.float32([0.1, 0.02]), ACTIONS)
     expected = scipys(ACTIONS, np.float32([-0.9, 0.55]), np.float32([0.1, 0.02]))
     assert expected.min() < -700
-    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    np.testing.assert_allclose(log_density, expected, rtol=1e-4)
 
 
 def test_epsilon_greedys_density_is_the_mixtures():
@@ -70,7 +70,7 @@ masks = arrays.arrays(bool, (2, 5))
 
 
 def mean_of_densities(values, filled):
-    """log mean_k exp over the components there are, an infinite one infinite."""
+    """log mean_k exp over the filled components; an infinite one makes it infinite."""
     values = np.float64(values)[np.array(filled)]
     finite = np.where(values == np.inf, 0.0, values)
     mixed = scipy.special.logsumexp(finite, axis=0) - np.log(len(values))
@@ -91,10 +91,10 @@ filled_components = st.lists(st.booleans(), min_size=3, max_size=3).filter(any)
 @pytest.mark.filterwarnings("ignore:divide by zero")
 @given(values=log_densities, filled=filled_components)
 def test_a_mixture_of_transitions_is_the_mean_density(values, filled):
-    # What is not yet filled may hold anything.
+    # Components that are not filled may hold any value.
     values[~np.array(filled)] = np.nan
-    found = transition_mixture(values, np.array(filled))
-    np.testing.assert_allclose(found, mean_of_densities(values, filled), rtol=1e-5, atol=1e-4)
+    log_density = transition_mixture(values, np.array(filled))
+    np.testing.assert_allclose(log_density, mean_of_densities(values, filled), rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.filterwarnings("ignore:divide by zero")
@@ -102,9 +102,9 @@ def test_a_mixture_of_transitions_is_the_mean_density(values, filled):
 def test_a_mixture_of_trajectories_is_the_mean_of_their_densities(values, steps, filled):
     values[~np.array(filled)] = np.nan
     values[:, ~steps] = np.nan
-    found = trajectory_mixture(values, steps, np.array(filled))
+    log_density = trajectory_mixture(values, steps, np.array(filled))
     expected = brute_force_trajectory(values, steps, filled)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(log_density, expected, rtol=1e-5, atol=1e-3)
 
 
 def test_all_components_are_the_default():
@@ -117,7 +117,7 @@ def test_all_components_are_the_default():
 
 
 def test_a_mixture_of_trajectories_is_not_one_of_steps():
-    """Two policies, each sure of its own action: no trajectory changes hands midway."""
+    """Two policies, each certain of its own action: a trajectory never mixes the two."""
     sure = np.log(np.float32([[0.9, 0.1], [0.1, 0.9]]))
     steps = np.ones(2, bool)
     assert trajectory_mixture(sure, steps) == pytest.approx(np.log(0.09))
@@ -125,7 +125,7 @@ def test_a_mixture_of_trajectories_is_not_one_of_steps():
 
 
 def test_mixtures_of_several_policies_estimate_the_partition_function():
-    """Of trajectories of two steps, each of one of two policies, and of their single steps."""
+    """For trajectories of two steps, each drawn from one of two policies, and for single steps."""
     rng = np.random.default_rng(0)
     means = np.float32([[0.0, 0.6], [2.5, 0.9]])
     scale = np.float32([1.4, 0.4])
@@ -150,7 +150,7 @@ def test_mixtures_of_several_policies_estimate_the_partition_function():
     total = reward(action).sum(axis=-1)
     assert deviation(of_steps[:, 0], reward(action[:, 0]), z) < 4
     assert deviation(trajectory_mixture(recorded, np.ones((20_000, 2), bool)), total, z**2) < 4
-    # Means taken step by step are of other trajectories, and miss.
+    # Means taken step by step are for other trajectories, and give another Z.
     assert deviation(of_steps.sum(axis=-1), total, z**2) > 10
 
 
@@ -176,14 +176,14 @@ def least_squares(observation, action, weight):
 def test_the_fitted_gaussian_is_float64_least_squares(weighted):
     observation, action = pairs()
     weight = np.random.default_rng(1).integers(0, 3, len(action)) if weighted else np.ones(400)
-    found = fit_gaussian(observation, action, np.float32(weight) if weighted else None)
+    fitted = fit_gaussian(observation, action, np.float32(weight) if weighted else None)
     coefficients, scale = least_squares(observation, action, weight)
-    np.testing.assert_allclose(found.coefficients, coefficients, rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(found.scale, scale, rtol=1e-4)
+    np.testing.assert_allclose(fitted.coefficients, coefficients, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(fitted.scale, scale, rtol=1e-4)
 
     mean = np.column_stack([np.ones(len(action)), observation]) @ coefficients
     np.testing.assert_allclose(
-        densities.gaussian_policy(SPEC, found, observation, action),
+        densities.gaussian_policy(SPEC, fitted, observation, action),
         scipys(action, mean, scale),
         rtol=1e-3,
         atol=1e-3,
@@ -193,23 +193,23 @@ def test_the_fitted_gaussian_is_float64_least_squares(weighted):
 def test_fits_vmap_over_the_weights():
     observation, action = pairs(40)
     weights = np.float32(np.arange(40) % 2 == np.arange(2)[:, None])
-    found = jax.vmap(fit_gaussian, in_axes=(None, None, 0))(observation, action, weights)
+    fitted = jax.vmap(fit_gaussian, in_axes=(None, None, 0))(observation, action, weights)
     for index, weight in enumerate(weights):
         expected = least_squares(observation, action, weight)[0]
-        np.testing.assert_allclose(found.coefficients[index], expected, rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(fitted.coefficients[index], expected, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("observation", [0.3, -0.07])
 def test_actions_without_noise_at_one_state_give_the_smallest_scale(observation):
     observation, action = np.full((40, 2), observation, np.float32), np.tile(MEAN, (40, 1))
-    found = fit_gaussian(observation, action)
-    np.testing.assert_allclose(found.coefficients, [MEAN, [0, 0], [0, 0]], atol=1e-6)
-    np.testing.assert_allclose(found.scale, densities.SCALE_FLOOR * np.array([2.0, 0.25]))
-    assert jnp.isfinite(densities.gaussian_policy(SPEC, found, observation[0], ACTIONS)).all()
+    fitted = fit_gaussian(observation, action)
+    np.testing.assert_allclose(fitted.coefficients, [MEAN, [0, 0], [0, 0]], atol=1e-6)
+    np.testing.assert_allclose(fitted.scale, densities.SCALE_FLOOR * np.array([2.0, 0.25]))
+    assert jnp.isfinite(densities.gaussian_policy(SPEC, fitted, observation[0], ACTIONS)).all()
 
 
 def test_the_fit_calls_no_lapack():
-    """Several CPU devices that are ahead of the host can wait in it for Python's lock for ever."""
+    """LAPACK can deadlock on Python's lock when several CPU devices run ahead of the host."""
     text = fit_gaussian.lower(np.ones((4, 2), np.float32), np.ones((4, 1), np.float32), None)
     assert "lapack" not in text.as_text().lower()
     solved = jax.jit(jnp.linalg.lstsq).lower(np.ones((4, 2), np.float32), np.ones((4, 1)))

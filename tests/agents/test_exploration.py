@@ -1,5 +1,6 @@
 import math
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,7 +104,7 @@ def test_samples_follow_the_clipped_normal(make, mu):
     law = scipy.stats.norm(mu + shift, 0.4 * HALF_WIDTH)
     below = [(action <= x).mean() for x in np.linspace(LOW, HIGH, 40)[:-1]]
     expected = law.cdf(np.linspace(LOW, HIGH, 40))
-    # The Kolmogorov-Smirnov distance that chance exceeds once in a thousand.
+    # The Kolmogorov-Smirnov distance with a p-value of 0.001.
     np.testing.assert_allclose([*below, (action < HIGH).mean()], expected, atol=1.95 / 20_000**0.5)
 
 
@@ -129,10 +130,10 @@ def test_ornstein_uhlenbeck_has_the_closed_form_variance_and_autocorrelation():
 def test_ornstein_uhlenbecks_marginal_density_is_of_the_stationary_law():
     behaviour = exploration.ornstein_uhlenbeck(SPEC)
     action = np.float32([[LOW], [0.3], [2.0], [HIGH]])
-    found = behaviour.log_density(behaviour.init(KEY), jnp.float32([0.5]), action, 0)
+    log_density = behaviour.log_density(behaviour.init(KEY), jnp.float32([0.5]), action, 0)
     law = scipy.stats.norm(0.5, 0.5 * HALF_WIDTH / np.sqrt(1 - 0.85**2))
     expected = [law.logcdf(LOW), *law.logpdf(action[1:3, 0]), law.logsf(HIGH)]
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    np.testing.assert_allclose(log_density, expected, rtol=1e-5)
 
 
 def test_ornstein_uhlenbeck_filters_its_noise():
@@ -215,10 +216,10 @@ def test_random_actions_are_held_for_exactly_hold_steps(hold):
 def test_epsilon_greedys_marginal_density_is_of_the_random_actions_share(step, epsilon, hold):
     behaviour = exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=hold))
     action = np.float32([[0.3], [2.0]])
-    found = behaviour.log_density(behaviour.init(KEY), action[:1], action, step)
-    # Of many choices, the random ones last for `hold` steps each.
+    log_density = behaviour.log_density(behaviour.init(KEY), action[:1], action, step)
+    # Each random choice lasts for `hold` steps.
     share = hold * epsilon / (hold * epsilon + 1 - epsilon)
-    np.testing.assert_allclose(np.exp(found), [np.inf, share / (HIGH - LOW)], rtol=1e-5)
+    np.testing.assert_allclose(np.exp(log_density), [np.inf, share / (HIGH - LOW)], rtol=1e-5)
 
 
 def test_the_noise_of_epsilon_greedy_is_on_the_greedy_action():
@@ -237,7 +238,7 @@ def test_the_noise_of_epsilon_greedy_is_on_the_greedy_action():
     np.testing.assert_allclose(np.exp(log_density), expected, rtol=1e-4)
 
 
-def test_noise_leaves_the_choices_and_the_random_actions_as_they_are():
+def test_noise_does_not_change_the_choices_or_the_random_actions():
     plain = exploration.epsilon_greedy(SPEC).draw(KEY)
     noisy = exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(noise=0.3)).draw(KEY)
     assert plain[2] is None
@@ -245,7 +246,7 @@ def test_noise_leaves_the_choices_and_the_random_actions_as_they_are():
 
 
 def test_with_noise_no_random_action_is_on_a_bound():
-    # Floats lie so far apart here that one draw in sixteen is rounded to a bound.
+    # Floats are so coarse here that one draw in sixteen would be rounded to a bound.
     coarse = SPEC._replace(action_low=np.float32([2**20]), action_high=np.float32([2**20 + 1]))
     behaviour = exploration.epsilon_greedy(coarse, EpsilonGreedyHParams(noise=0.3))
     action = jax.vmap(behaviour.draw)(jax.random.split(KEY, 1000))[1]
@@ -293,7 +294,7 @@ def test_sample_is_perturb_of_draw(kind):
     state, mu = behaviour.init(KEY), jnp.float32([0.3])
     sampled = behaviour.sample(KEY, state, mu, 100)
     perturbed = behaviour.perturb(state, mu, behaviour.draw(KEY), 100)
-    jax.tree.map(np.testing.assert_array_equal, sampled, perturbed)
+    chex.assert_trees_all_equal(sampled, perturbed)
 
 
 def test_hyperparameters_can_be_vmapped_over():
@@ -310,7 +311,7 @@ def test_hyperparameters_can_be_vmapped_over():
 
 
 MU, STEP, SHARE = 0.8, 2500, 0.505
-"""The greedy action, and a step with its epsilon, of the estimates of Z."""
+"""The greedy action of the estimates of Z, and a step with its epsilon."""
 
 
 def reward(action):
@@ -324,9 +325,9 @@ def integral(*, atoms):
 
 INSIDE, WITH_BOUNDS = integral(atoms=False), integral(atoms=True)
 HELD = 2 * SHARE / (1 + 2 * SHARE)
-"""The share of the steps at which an action that lasts three is being held."""
+"""The share of the steps at which a random action of three steps is being held."""
 ESTIMATES = {
-    # The behaviour, what its recorded densities estimate and what its marginal ones do.
+    # The behaviour, the estimate by its recorded densities and the one by its marginal densities.
     "gaussian": (
         exploration.gaussian(SPEC, GaussianHParams(scale=0.6)),
         WITH_BOUNDS,
@@ -348,7 +349,7 @@ ESTIMATES = {
         INSIDE,
         INSIDE,
     ),
-    # No held action is at a bound, so those steps miss the bounds' share.
+    # A held action is never at a bound, so these steps lack the bounds' share of Z.
     "noisy_held_epsilon_greedy": (
         exploration.epsilon_greedy(SPEC, EpsilonGreedyHParams(hold=3.0, noise=0.5)),
         HELD * INSIDE + (1 - HELD) * WITH_BOUNDS,
@@ -371,13 +372,13 @@ def test_actions_weighted_by_their_densities_estimate_the_partition_function(nam
         state, (action, recorded) = jax.lax.scan(
             advance, behaviour.init(key), jax.random.split(key, 40)
         )
-        # By then the noise's state has forgotten how it began.
+        # By then the noise is stationary.
         marginal = behaviour.log_density(state, jnp.float32([MU]), action[20:], STEP)
         return action[20:, 0], recorded[20:], marginal
 
     action, *log_densities = jax.tree.map(np.float64, run(jax.random.split(KEY, 8000)))
     for log_density, value in zip(log_densities, expected, strict=True):
-        # The steps of a lane depend on each other, the lanes do not.
+        # The steps of one run depend on each other; the runs are independent.
         estimates = np.exp(reward(action) - log_density).mean(axis=1)
         error = estimates.std() / len(estimates) ** 0.5
         assert error < 0.02 * value
@@ -385,7 +386,7 @@ def test_actions_weighted_by_their_densities_estimate_the_partition_function(nam
 
 
 @kinds
-def test_other_arrays_than_one_step_of_the_spec_are_refused(kind):
+def test_arrays_of_other_shapes_are_refused(kind):
     behaviour = BEHAVIOURS[kind]
     state = behaviour.init(KEY)
     for action in (jnp.zeros((5, 1)), jnp.zeros(2), jnp.zeros(())):
@@ -403,8 +404,8 @@ def test_other_arrays_than_one_step_of_the_spec_are_refused(kind):
 def test_marginal_densities_read_the_last_axis_and_broadcast_the_leading_ones(kind):
     behaviour = BEHAVIOURS[kind]
     state = behaviour.init(KEY)
-    found = behaviour.log_density(state, jnp.zeros((4, 1, 1)), jnp.ones((5, 1)), 0)
-    assert found.shape == (4, 5)
+    log_density = behaviour.log_density(state, jnp.zeros((4, 1, 1)), jnp.ones((5, 1)), 0)
+    assert log_density.shape == (4, 5)
     with pytest.raises(ValueError, match=r"greedy: expected shape \(1,\), got \(5,\)"):
         behaviour.log_density(state, jnp.zeros(5), jnp.zeros(5), 0)
     with pytest.raises(ValueError, match=r"\(5, 1\), \(7, 1\)"):

@@ -13,7 +13,7 @@ from cmedirl_jax.types import Network
 from tests.support import pools, reference
 from tests.support.agents import PROBE, SMALL, SPEC, random_batch, reference_q
 
-# Below the small network's differences of values, so that one of the steps leads by it.
+# Smaller than the small network's differences of values, so that one step has no loss.
 MARGIN = 0.02
 
 
@@ -77,10 +77,10 @@ def test_the_large_margin_is_a_hinge_on_how_far_the_demonstrated_action_leads():
         return hot_start.critic_loss(networks, slope, hparams, observation, action, jnp.zeros(2))[0]
 
     slopes, margins = np.meshgrid([0.0, 0.1, 0.5, 2.0], [0.0, 0.3, 0.8], indexing="ij")
-    found = jax.vmap(loss)(jnp.asarray(slopes.ravel()), jnp.asarray(margins.ravel()))
+    losses = jax.vmap(loss)(jnp.asarray(slopes.ravel()), jnp.asarray(margins.ravel()))
     leads = slopes.ravel()[:, None] * [1.0, 0.9]
     expected = np.maximum(margins.ravel()[:, None] - leads, 0.0).mean(axis=1)
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(losses, expected, atol=1e-6)
 
 
 def test_action_cells_are_the_product_grid_with_both_bounds():
@@ -110,10 +110,10 @@ def fitted():
 
 def test_the_fitted_actor_solves_the_task_it_was_shown(fitted):
     agent, _, state, _ = fitted
-    found = evaluation.evaluate(
+    evaluated = evaluation.evaluate(
         lambda observation: agent.act(state, observation), pools.ENV, pools.ENV.default_params, 10
     )
-    assert found.return_mean >= SPEC.reward_threshold
+    assert evaluated.return_mean >= SPEC.reward_threshold
 
 
 def test_the_quadratic_critic_comes_to_the_demonstrated_returns(fitted):
@@ -137,7 +137,7 @@ def test_the_targets_are_copies_of_the_fitted_parameters(fitted):
 
 
 @pytest.mark.parametrize("kind", ["softmax", "one-hot", "quadratic"])
-def test_a_subset_alone_is_read(kind):
+def test_only_the_subset_is_read(kind):
     pool = pools.scripted()
     everything = demonstrations.episodes(pool)
     own = demonstrations.DemonstrationSubset(everything.start[3:5], everything.length[3:5])
@@ -171,6 +171,6 @@ def test_a_pool_can_be_passed_as_it_is():
         ({"reward_scale": float("inf")}, "reward_scale must be positive and finite, got inf"),
     ],
 )
-def test_data_for_no_agent_is_refused(given, message):
+def test_impossible_discounts_and_scales_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
         hot_start.data(pools.scripted(2), **given)

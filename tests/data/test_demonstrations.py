@@ -1,3 +1,4 @@
+import chex
 import jax
 import numpy as np
 import pytest
@@ -106,7 +107,7 @@ def test_subsets_that_contradict_themselves_are_refused(change, error, message):
         demonstrations.sample_episodes(KEY, subset, 3)
 
 
-def test_samples_of_a_negative_number_are_refused():
+def test_negative_sample_sizes_are_refused():
     with pytest.raises(ValueError, match="batch_size must be at least 0, got -1"):
         demonstrations.sample_index(KEY, SUBSET, -1)
     with pytest.raises(ValueError, match="count must be at least 0, got -1"):
@@ -118,7 +119,7 @@ def test_a_sample_is_whole_transitions_of_the_pool():
     batch = jax.device_get(demonstrations.sample(KEY, pool, SUBSET, 50))
     step = np.argmax(batch.reward[:, None] == pool.reward, axis=1)
     assert set(step) <= {4, 5, 6, 7, 10, 11, 12, 13, 14, 15}
-    jax.tree.map(lambda rows, leaf: np.testing.assert_array_equal(rows, leaf[step]), batch, pool)
+    chex.assert_trees_all_equal(batch, demonstrations.at(pool, step))
 
 
 @given(lengths=pools.episode_lengths, discount=st.floats(0, 1))

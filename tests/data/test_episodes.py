@@ -1,5 +1,6 @@
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,13 +20,13 @@ BITS = np.random.default_rng(0).integers(0, 2**32, 20_000, dtype=np.uint32)
 def jitted(capacity, replay_capacity):
     ring = episodes.make(capacity, replay_capacity, MAX_LENGTH)
     take = jax.jit(ring.take, static_argnums=3)
-    # Under `vmap` the step is what all seeds share.
+    # All seeds share the step number, so `vmap` leaves it unbatched.
     together = jax.jit(jax.vmap(ring.step, in_axes=(0, None, 0)))
     return ring._replace(step=jax.jit(ring.step), take=take), together
 
 
 def lasting(lengths, running=0):
-    """Which steps end an episode, of episodes one after the other and one that still runs."""
+    """Which steps end an episode, for consecutive episodes and a last one that still runs."""
     done = np.zeros(sum(lengths) + running, bool)
     done[np.cumsum(lengths, dtype=int) - 1] = True
     return done
@@ -43,17 +44,17 @@ sizes = st.tuples(st.sampled_from([1, 3]), st.sampled_from([1, 7, 50]))
 
 
 @given(lengths, st.integers(0, MAX_LENGTH - 1), sizes)
-def test_what_is_taken_is_the_latest_episodes_or_nothing(lengths, running, sizes):
+def test_take_gives_one_of_the_latest_episodes_or_nothing(lengths, running, sizes):
     (ring, _), done = jitted(*sizes), lasting(lengths, running)
     finished, stored = played(done, sizes[1])
     rows, mask = ring.take(after(ring, done), BITS[:100], len(done))
     assert rows.shape == mask.shape == (100, MAX_LENGTH)
     assert rows.min() >= 0
     assert rows.max() < sizes[1]
-    found = {tuple(stored[row] for row in np.asarray(rows[i])[mask[i]]) for i in range(100)}
+    taken = {tuple(stored[row] for row in np.asarray(rows[i])[mask[i]]) for i in range(100)}
     latest = finished[-sizes[0] :]
     expected = {episode for episode in latest if set(episode) <= set(stored)}
-    assert found == (expected or {()})
+    assert taken == (expected or {()})
     # The steps come first, the padding last.
     assert not np.any(mask[:, 1:] & ~mask[:, :-1])
 
@@ -99,7 +100,7 @@ def test_vmapped_rings_do_not_mix():
         states = together(states, step, done[:, step])
     for index, ends in enumerate(done):
         alone = after(ring, ends)
-        jax.tree.map(lambda a, b, i=index: np.testing.assert_array_equal(a[i], b), states, alone)
+        chex.assert_trees_all_equal(jax.tree.map(lambda leaf, i=index: leaf[i], states), alone)
     assert together._cache_size() == 1
 
 
@@ -116,7 +117,7 @@ def test_bits_are_unsigned(dtype):
         ring.take(ring.init(), jnp.zeros(3, dtype), 0)
 
 
-def test_a_window_of_nothing_is_refused():
+def test_a_window_of_size_zero_is_refused():
     ring, _ = jitted(3, 7)
     with pytest.raises(ValueError, match="recent must be at least 1, got 0"):
         ring.take(ring.init(), BITS[:3], 0, 0)

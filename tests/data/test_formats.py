@@ -109,7 +109,7 @@ def test_a_flipped_bit_is_refused_or_harmless(path, saved, position, bit):
 
 
 # Offsets into an entry of a zip file's central directory: the version needed to extract it, its
-# flags (1: encrypted) and its compression method (12: bzip2, 14: lzma, 99: none there is).
+# flags (1: encrypted) and its compression method (12: bzip2, 14: lzma, 99: unknown).
 @pytest.mark.parametrize(("offset", "value"), [(6, 255), (8, 1), (10, 12), (10, 14), (10, 99)])
 def test_a_damaged_zip_directory_is_refused(path, saved, offset, value):
     content = bytearray(saved)
@@ -219,7 +219,7 @@ def test_a_foreign_file_is_refused(path, foreign):
 
 
 class Unpickled:
-    """Leaves a mark where it is unpickled."""
+    """Creates the file `mark` when it is unpickled."""
 
     def __init__(self, mark):
         self.mark = mark
@@ -294,7 +294,7 @@ def test_sizes_that_the_archives_directory_exaggerates_too_are_refused_unread(pa
         demonstrations.load(path)
 
 
-def test_what_compresses_best_still_loads(path):
+def test_a_highly_compressible_pool_loads(path):
     steps = 2 * 10**6
     zeros = np.zeros(steps, np.float32)
     pool = Demonstrations(

@@ -1,6 +1,7 @@
 import collections
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,7 +52,7 @@ def filled(buffer, count):
 
 
 def assert_equal(actual, expected):
-    jax.tree.map(np.testing.assert_array_equal, actual, expected)
+    chex.assert_trees_all_equal(actual, expected)
 
 
 @given(capacity=st.sampled_from([1, 2, 5]), count=st.integers(0, 13))
@@ -165,7 +166,7 @@ def test_impossible_samples_are_refused():
             buffer.take(state, bits)
 
 
-def test_a_batch_of_nothing_is_empty():
+def test_a_batch_of_size_zero_is_empty():
     buffer = replay.make(SPEC, 3)
     assert buffer.sample(KEY, buffer.init(), 0).observation.shape == (0, 2)
 

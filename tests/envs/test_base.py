@@ -10,21 +10,21 @@ from cmedirl_jax.training.methods import METHODS
 
 
 def stepping(env, **changes):
-    """The environment with other fields in what its steps return."""
+    """The environment, with changed fields in its `Step`."""
 
     def step(key, state, action, params):
-        state, found = env.step(key, state, action, params)
-        return state, found._replace(**{name: change(found) for name, change in changes.items()})
+        state, answer = env.step(key, state, action, params)
+        return state, answer._replace(**{name: change(answer) for name, change in changes.items()})
 
     return env._replace(step=step)
 
 
 def in_state(env, change):
-    """The environment with another state after a step."""
+    """The environment, with a changed state after a step."""
 
     def step(key, state, action, params):
-        state, found = env.step(key, state, action, params)
-        return change(state), found
+        state, answer = env.step(key, state, action, params)
+        return change(state), answer
 
     return env._replace(step=step)
 
@@ -66,27 +66,27 @@ def starting(env, change):
             "observation of reset: expected floats, got int32",
         ),
         (
-            lambda env: stepping(env, observation=lambda found: found.observation[None]),
+            lambda env: stepping(env, observation=lambda answer: answer.observation[None]),
             ValueError,
             r"observation of step: expected shape \(2,\), got \(1, 2\)",
         ),
         (
-            lambda env: stepping(env, reward=lambda found: found.observation),
+            lambda env: stepping(env, reward=lambda answer: answer.observation),
             ValueError,
             r"reward: expected shape \(\), got \(2,\)",
         ),
         (
-            lambda env: stepping(env, reward=lambda found: found.reward.astype(int)),
+            lambda env: stepping(env, reward=lambda answer: answer.reward.astype(int)),
             TypeError,
             "reward: expected floats, got int32",
         ),
         (
-            lambda env: stepping(env, terminated=lambda found: found.terminated * 1.0),
+            lambda env: stepping(env, terminated=lambda answer: answer.terminated * 1.0),
             TypeError,
             "terminated: expected bool, got float32",
         ),
         (
-            lambda env: stepping(env, truncated=lambda found: found.truncated[None]),
+            lambda env: stepping(env, truncated=lambda answer: answer.truncated[None]),
             ValueError,
             r"truncated: expected shape \(\), got \(1,\)",
         ),
@@ -129,13 +129,13 @@ def test_an_environment_that_does_not_keep_to_its_specification_is_refused(
         training.fit(jax.random.key(0), spoilt, "ddpg", seeds=1, steps=1, evaluate_every=1)
 
 
-def test_other_parameters_are_checked_too(env):
+def test_given_parameters_are_checked(env):
     class Params(flax.struct.PyTreeNode):
         goal_reward: jax.Array
 
     def step(key, state, action, params):
-        state, found = env.step(key, state, action, env.default_params)
-        return state, found._replace(reward=found.reward + params.goal_reward)
+        state, answer = env.step(key, state, action, env.default_params)
+        return state, answer._replace(reward=answer.reward + params.goal_reward)
 
     given = Env(
         env.spec,

@@ -1,4 +1,4 @@
-"""Parity with Gymnasium's own MountainCarContinuous-v0, and what the port adds to it."""
+"""Parity with Gymnasium's MountainCarContinuous-v0, and what the port adds to it."""
 
 import chex
 import gymnasium
@@ -55,7 +55,7 @@ def test_step_matches_gymnasium_on_a_grid(car):
     expected = np.array([gymnasium_step(car, *row) for row in grid])
 
     np.testing.assert_allclose(result.observation, expected[:, :2], rtol=0, atol=1e-6)
-    # A state that rounding can put on either side of the goal's edge is no evidence.
+    # Rounding decides on which side of the goal's edge some states lie: leave them out.
     tie = (np.abs(expected[:, 0] - car.goal_position) < 1e-6) | (np.abs(expected[:, 1]) < 1e-7)
     tie &= expected[:, 0] > car.goal_position - 1e-6
     assert tie.mean() < 0.01
@@ -218,7 +218,7 @@ def test_observations_stay_in_the_spec_bounds(position, velocity, action):
 
 
 def test_other_values_do_not_recompile():
-    # Fresh by its wrapper: jitted copies of one function share their compiled programs.
+    # The wrapper is a new function: jitted copies of one function share compiled programs.
     jitted = jax.jit(chex.assert_max_traces(ENV.step, n=1))
     jitted(KEY, state(-0.5, 0.0), jnp.array([0.1]), PARAMS)
     jitted(jax.random.key(1), state(0.2, 0.05, 7), jnp.array([-0.4]), PARAMS.replace(power=0.002))
@@ -228,7 +228,7 @@ def test_a_batch_of_one_equals_no_batch():
     single = step(KEY, state(-0.7, 0.02, 3), jnp.array([0.3]), PARAMS)
     batch = jax.tree.map(lambda x: x[None], state(-0.7, 0.02, 3))
     batched = step_many(KEY, batch, jnp.array([[0.3]]), PARAMS)
-    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y[0]), single, batched)
+    chex.assert_trees_all_equal(single, jax.tree.map(lambda leaf: leaf[0], batched))
 
 
 def test_step_keeps_shapes_and_dtypes():

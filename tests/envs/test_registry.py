@@ -9,13 +9,13 @@ def test_an_unknown_environment_is_refused_with_the_known_ones():
         envs.make("Pendulum-v0")
 
 
-def test_an_environment_of_ones_own_is_made_by_its_name(env, monkeypatch):
+def test_a_registered_environment_is_made_by_its_name(env, monkeypatch):
     monkeypatch.setattr(envs.registry, "ENVS", ENVS.copy())
     own = env._replace(spec=env.spec._replace(id="Own-v0"))
     envs.register("Own-v0", lambda: own)
     assert envs.make("Own-v0") is own
 
 
-def test_a_registered_name_is_not_taken_twice(env):
+def test_a_name_is_registered_only_once(env):
     with pytest.raises(ValueError, match="'MountainCarContinuous-v0' is already registered"):
         envs.register("MountainCarContinuous-v0", lambda: env)

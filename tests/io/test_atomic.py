@@ -8,13 +8,13 @@ import pytest
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import atomic, checkpoint
 from cmedirl_jax.runs.console.signals import Interruption
-from cmedirl_jax.runs.storage.checkpoints import Keeper
+from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from tests.support import pools
 
 
 @pytest.fixture
 def events(monkeypatch):
-    """What is flushed and moved, in order, each with its path at that time."""
+    """The flushes and moves in order, each with the path it had at that time."""
     events, fsync, replace = [], os.fsync, os.replace
 
     def noted_fsync(descriptor):
@@ -31,11 +31,11 @@ def events(monkeypatch):
 
 
 def assert_safe(events, path, partial):
-    """All that is at `path` was flushed before it was moved there; then the folder was."""
-    below = [partial / found.relative_to(path) for found in path.rglob("*")]
+    """Everything at `path` was flushed before it was moved there, and its folder afterwards."""
+    below = [partial / entry.relative_to(path) for entry in path.rglob("*")]
     moved = events.index(("move", partial))
-    for found in (partial, *below):
-        assert ("flush", found) in events[:moved]
+    for entry in (partial, *below):
+        assert ("flush", entry) in events[:moved]
     assert ("flush", path.parent) in events[moved:]
 
 
@@ -63,19 +63,21 @@ def test_demonstrations_are_flushed(tmp_path, events):
 
 @needs_proc
 def test_checkpoints_are_flushed(tmp_path, events):
-    with Keeper(tmp_path, {}, every=0.0, interruption=Interruption(), say=pytest.fail) as keeper:
-        keeper.visit(250, lambda: ({"weights": np.zeros(3)}, {"rows": np.arange(2)}))
+    with Checkpointer(
+        tmp_path, {}, every=0.0, interruption=Interruption(), say=pytest.fail
+    ) as checkpointer:
+        checkpointer.save_if_due(250, lambda: ({"weights": np.zeros(3)}, {"rows": np.arange(2)}))
     assert_safe(events, tmp_path / "250", tmp_path / ".partial")
 
 
 @needs_proc
-def test_a_tree_that_was_saved_is_flushed(tmp_path, events):
+def test_saved_trees_are_flushed(tmp_path, events):
     checkpoint.save(tmp_path / "tree", {"weights": np.zeros(3)})
     flushed = {path for what, path in events if what == "flush"}
     assert flushed >= {tmp_path, tmp_path / "tree", *(tmp_path / "tree").rglob("*")}
 
 
-def test_a_file_system_that_flushes_no_folders_will_do(tmp_path, monkeypatch):
+def test_file_systems_that_cannot_flush_folders_are_supported(tmp_path, monkeypatch):
     def fail(number):
         def fsync(descriptor):
             raise OSError(number, os.strerror(number))

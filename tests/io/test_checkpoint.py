@@ -9,7 +9,7 @@ import pytest
 
 from cmedirl_jax.io import checkpoint
 
-# Orbax says so on every load that names no shardings, as for a checkpoint read without `like`.
+# Orbax warns on every load without shardings, which is how `load` without `like` reads.
 pytestmark = pytest.mark.filterwarnings("ignore:Sharding info not provided:UserWarning")
 
 
@@ -85,7 +85,7 @@ def test_saving_replaces_what_is_there(tmp_path):
 
 @pytest.mark.parametrize("like", [None, STATE])
 @pytest.mark.parametrize("kind", ["nothing", "file", "folder"])
-def test_what_is_no_checkpoint_is_not_found(tmp_path, kind, like):
+def test_a_folder_without_a_checkpoint_is_not_found(tmp_path, kind, like):
     path = tmp_path / "here"
     if kind == "file":
         path.write_text("")
@@ -111,7 +111,7 @@ def test_another_structure_is_refused(path, like):
         checkpoint.load(path, like)
 
 
-# Where one of orbax's reads fails it abandons the others, and the collector complains of them.
+# When one of orbax's reads fails it abandons the others, which warn when they are collected.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("shape", [(2,), (5,), (3, 1), ()])
 def test_another_shape_is_refused(tmp_path, shape):

@@ -20,7 +20,7 @@ kinds = pytest.mark.parametrize(
 
 
 @kinds
-def test_a_batch_of_its_shapes_passes_as_it_is(check, leading, axes, skewed_spec):
+def test_a_valid_batch_is_returned_unchanged(check, leading, axes, skewed_spec):
     given = batch(*leading)
     assert check(skewed_spec, given, "background") is given
 
@@ -28,11 +28,11 @@ def test_a_batch_of_its_shapes_passes_as_it_is(check, leading, axes, skewed_spec
 @kinds
 def test_transitions_get_uniform_weights_and_a_full_mask(check, leading, axes, skewed_spec):
     given = transition(*leading)
-    found = check(skewed_spec, given, "background")
-    assert found.transition is given
-    np.testing.assert_array_equal(found.log_density, np.zeros(leading[0]))
-    np.testing.assert_array_equal(found.mask, np.ones(leading, bool))
-    assert found.mask.dtype == bool
+    filled = check(skewed_spec, given, "background")
+    assert filled.transition is given
+    np.testing.assert_array_equal(filled.log_density, np.zeros(leading[0]))
+    np.testing.assert_array_equal(filled.mask, np.ones(leading, bool))
+    assert filled.mask.dtype == bool
 
 
 @kinds
@@ -46,7 +46,7 @@ def test_transitions_get_uniform_weights_and_a_full_mask(check, leading, axes, s
         ("mask", "mask", ""),
     ],
 )
-def test_a_wrong_shape_is_refused_by_its_batch_and_name(
+def test_a_wrong_shape_is_refused_naming_the_batch_and_the_leaf(
     check, leading, axes, leaf, called, size, skewed_spec
 ):
     given = batch(*leading)
@@ -66,7 +66,7 @@ def test_a_wrong_shape_is_refused_by_its_batch_and_name(
         assert str(wrong.shape) in str(info.value)
 
 
-def test_pairs_are_no_trajectories(skewed_spec):
+def test_pairs_are_refused_as_trajectories(skewed_spec):
     with pytest.raises(ValueError, match=r"demonstrations: expected observations \[B, 3\]"):
         base.pairs(skewed_spec, batch(4, 6), "demonstrations")
     with pytest.raises(ValueError, match=r"demonstrations: expected observations \[M, T, 3\]"):

@@ -24,7 +24,7 @@ init = jax.jit(OF_ONE.init)
 
 @jax.jit
 def standardised(state, *pairs):
-    """What the bound squashes."""
+    """The random reward before its bound."""
     return jnp.arctanh(OF_ONE.reward(state, *pairs))
 
 
@@ -32,20 +32,20 @@ def test_a_constant_is_the_same_everywhere():
     control = controls.constant(-0.3)
     state = control.init(KEY)
     for leading in ((), (4,), (2, 3)):
-        found = control.reward(state, jnp.zeros((*leading, 2)), jnp.ones((*leading, 1)))
-        np.testing.assert_array_equal(found, np.full(leading, -0.3, np.float32))
+        reward = control.reward(state, jnp.zeros((*leading, 2)), jnp.ones((*leading, 1)))
+        np.testing.assert_array_equal(reward, np.full(leading, -0.3, np.float32))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_random_reward_has_mean_zero_and_deviation_one_over_other_uniform_pairs(seed):
-    found = np.float64(standardised(init(jax.random.key(seed)), *PAIRS))
-    # 1024 pairs standardise it, so its mean is off by 1/32 or so.
-    assert abs(found.mean()) < 0.15
-    assert found.std() == pytest.approx(1.0, abs=0.1)
+    output = np.float64(standardised(init(jax.random.key(seed)), *PAIRS))
+    # It is standardised over 1024 pairs, so its mean is off by about 1/32.
+    assert abs(output.mean()) < 0.15
+    assert output.std() == pytest.approx(1.0, abs=0.1)
 
 
 def test_its_mean_and_deviation_are_those_of_the_network_over_the_bounds(skewed_spec):
-    """Of a network that is a coordinate, the moments of a uniform law are known."""
+    """A network that returns a coordinate has the moments of a uniform law."""
     coordinates = [
         (lambda observation, action: observation[..., 2], 2.0, 10.0),
         (lambda observation, action: action[..., 1], 0.5, 1.0),
@@ -61,9 +61,9 @@ def test_its_mean_and_deviation_are_those_of_the_network_over_the_bounds(skewed_
 
 
 def test_the_bound_squashes_the_standardised_network():
-    found = BOUNDED.reward(BOUNDED.init(KEY), *PAIRS)
-    np.testing.assert_allclose(found, 0.2 * np.tanh(standardised(init(KEY), *PAIRS)), atol=1e-5)
-    assert np.std(found) > 0.1
+    reward = BOUNDED.reward(BOUNDED.init(KEY), *PAIRS)
+    np.testing.assert_allclose(reward, 0.2 * np.tanh(standardised(init(KEY), *PAIRS)), atol=1e-5)
+    assert np.std(reward) > 0.1
 
 
 @pytest.mark.parametrize("control", [controls.constant(0.1), OF_ONE], ids=["constant", "random"])

@@ -37,14 +37,14 @@ update = jax.jit(ALGORITHM.update)
 
 
 def begun():
-    """The last layer begins near zero, where D is a half of everything."""
+    """The last layer starts near zero, where D is a half everywhere."""
     state = ALGORITHM.init(KEY)
     return state.replace(params=jax.tree.map(lambda leaf: 3.0 * leaf, state.params))
 
 
 def masked(key, size):
     mask = np.arange(size) % 3 > 0
-    # What the laws of the samples are is nothing to a discriminator.
+    # A discriminator ignores the samples' densities.
     return RewardBatch(random_batch(jax.random.key(key), size), jnp.arange(1.0 * size), mask)
 
 
@@ -92,7 +92,7 @@ def test_infos_are_of_the_state_before_the_update():
     assert {leaf.shape for leaf in info} == {()}
 
 
-def test_what_the_mask_leaves_out_does_not_count():
+def test_masked_entries_do_not_count():
     demonstrations, background = masked(1, 7), masked(2, 5)
     spoilt = jax.tree.map(
         lambda leaf: jnp.where(
@@ -100,9 +100,9 @@ def test_what_the_mask_leaves_out_does_not_count():
         ),
         background.transition,
     )
-    found = update(begun(), demonstrations, background)
+    updated = update(begun(), demonstrations, background)
     spoilt = update(begun(), demonstrations, background._replace(transition=spoilt))
-    chex.assert_trees_all_equal(found, spoilt)
+    chex.assert_trees_all_equal(updated, spoilt)
 
 
 def pairs(counts):
@@ -129,10 +129,10 @@ def test_rewards_are_functions_of_the_discriminator(form):
     algorithm = learner(GAILHParams(scale=0.7, form=form), network=TABLE)
     state = algorithm.init(KEY).replace(params=jnp.asarray(logit))
     batch = pairs(np.ones(CELLS, int))
-    found = jax.jit(algorithm.reward)(state, batch.observation, batch.action)
+    reward = jax.jit(algorithm.reward)(state, batch.observation, batch.action)
     log_d, log_rest = (scipy.special.log_expit(sign * np.float64(logit)) for sign in (1, -1))
     expected = 0.7 * FORMS[form](log_d, log_rest)
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    np.testing.assert_allclose(reward, expected, rtol=1e-5)
     signs = {"-log(1 - D)": {1.0}, "log D": {-1.0}, "logit D": {-1.0, 1.0}}
     assert set(np.sign(expected)) == signs[form]
 

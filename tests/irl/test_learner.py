@@ -60,15 +60,15 @@ def test_gradient_equals_finite_differences_of_a_float64_posterior(
         RewardBatch(batch, jnp.asarray(log_b, jnp.float32), jnp.ones(len(log_b), bool))
         for batch, log_b in zip(batches_, density, strict=True)
     ]
-    # The last layer begins near zero, where bounded and unbounded rewards cannot be told apart.
+    # The last layer starts near zero, where bounded and unbounded rewards are nearly equal.
     params = jax.tree.map(lambda leaf: 3.0 * leaf, before.params.network)
     absorbed = jnp.asarray(0.07) if absorbing else None
     before = before.replace(params=before.params._replace(network=params, absorbing=absorbed))
     after, info = algorithm.update(before, *given)
 
     def negative_posterior(learned):
-        found, scores = [outputs(learned[0], batch) for batch in batches_], []
-        for f, batch, log_b in zip(found, batches_, density, strict=True):
+        raw, scores = [outputs(learned[0], batch) for batch in batches_], []
+        for f, batch, log_b in zip(raw, batches_, density, strict=True):
             r, z = squashed(f, bounded_by), np.exp(-log_b)
             if absorbing:
                 ends = np.asarray(batch.terminated)
@@ -79,7 +79,7 @@ def test_gradient_equals_finite_differences_of_a_float64_posterior(
         r, z = map(np.concatenate, zip(*scores, strict=True)) if append else on_background
         expected = (z / z.sum()) @ r if objective == "visitation" else log_mean_exp(r, z)
         prior = -0.5 * 0.2 * sum((leaf**2).sum() for leaf in jax.tree.leaves(learned))
-        penalty = 0.3 * np.mean(np.concatenate(found) ** 2)
+        penalty = 0.3 * np.mean(np.concatenate(raw) ** 2)
         if absorbing:
             penalty += 0.3 * learned[1] ** 2
         return -(on_demo.mean() - expected + prior) + penalty
@@ -123,7 +123,7 @@ def test_trajectories_give_the_gradient_of_a_float64_posterior_absorbing_states_
             ended = (np.asarray(batch.terminated) & mask).any(axis=1)
             f = np.where(mask, f, np.where(ended[:, None], learned[1], 0.0))
             returns.append((f * 0.9 ** np.arange(steps)).sum(axis=1))
-        # The trajectory of length 0 is not there.
+        # A trajectory of length 0 is left out.
         r, z = np.r_[returns[0], returns[1][:2]], np.exp(-np.array([0.5, -0.3, 0.2, 0.5, -0.3]))
         value = returns[0].mean() - log_mean_exp(r, z)
         return -value + 0.3 * (np.mean(np.concatenate(squares)) + learned[1] ** 2)
@@ -160,12 +160,12 @@ def test_the_gradient_penalty_is_taken_between_the_batches_and_needs_a_key():
         )
 
     expected = jax.tree.map(lambda leaf: 0.5 * leaf, jax.grad(penalty)(state.params.network))
-    found = jax.tree.map(jnp.subtract, moves[1].network, moves[0].network)
-    chex.assert_trees_all_close(found, expected, rtol=1e-3, atol=1e-6)
+    difference = jax.tree.map(jnp.subtract, moves[1].network, moves[0].network)
+    chex.assert_trees_all_close(difference, expected, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize("gauge", ["zero-mean", "demonstration-maximum"])
-def test_the_gauge_follows_its_batches_and_lies_in_every_reward(gauge):
+def test_the_gauge_follows_its_batches_and_is_subtracted_from_every_reward(gauge):
     algorithm = learner(IRLHParams(gauge=gauge, gauge_rate=0.25, absorbing=True))
     state, (demonstrations, background) = algorithm.init(jax.random.key(0)), batches()
     bare = state.replace(params=state.params._replace(offset=jnp.zeros(())))

@@ -25,12 +25,12 @@ def differences(objective, demonstrations, background, append):
     """dL/dr of both batches, and the estimate."""
 
     def value(on_demonstrations, on_background):
-        found = objective(
+        likelihood = objective(
             demonstrations._replace(reward=on_demonstrations),
             background._replace(reward=on_background),
             append=append,
         )
-        return found.value, found
+        return likelihood.value, likelihood
 
     return jax.grad(value, argnums=(0, 1), has_aux=True)(demonstrations.reward, background.reward)
 
@@ -68,11 +68,11 @@ def test_the_derivative_by_the_rewards_is_the_difference_in_weighted_visits(
     for seed in range(5):
         rng = np.random.default_rng(seed)
         batches = random_scored(rng, 6), random_scored(rng, 9)
-        slopes, found = differences(objective, *map(as_jax, batches), append)
+        slopes, likelihood = differences(objective, *map(as_jax, batches), append)
         expected, value, size = by_counting(objective, *batches, append)
         np.testing.assert_allclose(np.concatenate(slopes), expected, atol=1e-12)
-        assert found.value == pytest.approx(value, abs=1e-12)
-        assert found.effective_sample_size == pytest.approx(size, rel=1e-12)
+        assert likelihood.value == pytest.approx(value, abs=1e-12)
+        assert likelihood.effective_sample_size == pytest.approx(size, rel=1e-12)
 
 
 def as_jax(scored):
@@ -80,20 +80,20 @@ def as_jax(scored):
 
 
 @pytest.mark.parametrize("objective", [objectives.visitation, objectives.transition])
-def test_where_nothing_is_sampled_nothing_is_learned(objective):
+def test_without_samples_the_likelihood_and_its_gradient_are_zero(objective):
     demonstrations = Scored(jnp.ones(2), jnp.zeros(2), jnp.ones(2, bool))
     for background in (
         Scored(jnp.ones(3), jnp.zeros(3), jnp.zeros(3, bool)),
         Scored(jnp.ones(3), jnp.full(3, -jnp.inf), jnp.ones(3, bool)),
     ):
-        slopes, found = differences(objective, demonstrations, background, append=False)
+        slopes, likelihood = differences(objective, demonstrations, background, append=False)
         assert all((slope == 0).all() for slope in slopes)
-        assert (found.value, found.effective_sample_size) == (0.0, 0.0)
+        assert (likelihood.value, likelihood.effective_sample_size) == (0.0, 0.0)
 
 
-def test_infinite_densities_of_either_sign_have_weight_zero_and_nan_is_seen():
-    found = objectives.log_weight(jnp.array([jnp.inf, -jnp.inf, 2.0, -300.0, jnp.nan]))
-    np.testing.assert_array_equal(found, [-np.inf, -np.inf, -2.0, 300.0, np.nan])
+def test_infinite_densities_of_either_sign_have_weight_zero_and_nan_is_kept():
+    log_weight = objectives.log_weight(jnp.array([jnp.inf, -jnp.inf, 2.0, -300.0, jnp.nan]))
+    np.testing.assert_array_equal(log_weight, [-np.inf, -np.inf, -2.0, 300.0, np.nan])
 
 
 weigh = jax.jit(objectives.weighed, static_argnames="append")
@@ -106,20 +106,20 @@ some_weights = st.lists(
 def test_weights_are_tempered_and_clipped_about_the_mean_of_all_samples(
     first, second, append, exponent, limit
 ):
-    padded = [np.float32([*found, *[0.0] * (6 - len(found))]) for found in (first, second)]
-    masks = [np.arange(6) < len(found) for found in (first, second)]
+    padded = [np.float32([*weights, *[0.0] * (6 - len(weights))]) for weights in (first, second)]
+    masks = [np.arange(6) < len(weights) for weights in (first, second)]
     batches = [
         Scored(jnp.zeros(6), jnp.asarray(log_weight), jnp.asarray(mask))
         for log_weight, mask in zip(padded, masks, strict=True)
     ]
-    found = weigh(*batches, append=append, exponent=exponent, limit=limit)
+    weighed = weigh(*batches, append=append, exponent=exponent, limit=limit)
     used = [
         exponent * log_weight[mask & np.isfinite(log_weight)].astype(np.float64)
         for log_weight, mask in zip(padded, masks, strict=True)
     ]
     samples = np.concatenate(used if append else used[1:])
     centre = samples.mean() if samples.size else 0.0
-    for scored, log_weight, mask, own in zip(found, padded, masks, used, strict=True):
+    for scored, log_weight, mask, own in zip(weighed, padded, masks, used, strict=True):
         kept = mask & np.isfinite(log_weight)
         expected = np.clip(own, centre - limit, centre + limit)
         np.testing.assert_allclose(scored.log_weight[kept], expected, rtol=1e-4, atol=1e-3)
@@ -239,7 +239,7 @@ def sampled_gradient(key, count, append):
 
 
 def with_mixture_density(batch):
-    """Of trajectories drawn half from the demonstrator and half from the uniform policy."""
+    """With half of the trajectories from the demonstrator and half from the uniform policy."""
 
     def under(policy):
         chosen = jnp.einsum(
@@ -260,9 +260,9 @@ def test_the_trajectory_estimate_converges_to_the_exact_gradient_as_one_over_roo
     sizes, errors = (16, 128, 1024), []
     for size in sizes:
         keys = jax.random.split(jax.random.key(size), 100)
-        found = jax.jit(jax.vmap(lambda key, n=size: sampled_gradient(key, n, append)))(keys)
-        errors.append(np.sqrt(np.mean((np.asarray(found) - exact) ** 2)))
-        bias = np.abs(np.asarray(found).mean(axis=0) - exact).max()
+        gradients = jax.jit(jax.vmap(lambda key, n=size: sampled_gradient(key, n, append)))(keys)
+        errors.append(np.sqrt(np.mean((np.asarray(gradients) - exact) ** 2)))
+        bias = np.abs(np.asarray(gradients).mean(axis=0) - exact).max()
     slope = np.polyfit(np.log(sizes), np.log(errors), 1)[0]
     assert slope == pytest.approx(-0.5, abs=0.06)
     assert errors[-1] < 0.03

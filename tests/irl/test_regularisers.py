@@ -54,19 +54,19 @@ def test_the_prior_is_a_gaussians_logarithm():
     assert regularisers.log_prior(params, 0.3) == pytest.approx(expected, rel=1e-6)
 
 
-def test_the_output_penalty_is_the_mean_square_of_what_the_mask_leaves():
-    found = regularisers.output_penalty(VALUES, MASK)
-    np.testing.assert_allclose(found, np.mean(np.float64(VALUES[MASK]) ** 2), rtol=1e-6)
+def test_the_output_penalty_is_the_mean_square_of_unmasked_outputs():
+    value = regularisers.output_penalty(VALUES, MASK)
+    np.testing.assert_allclose(value, np.mean(np.float64(VALUES[MASK]) ** 2), rtol=1e-6)
     spoilt = np.where(MASK, VALUES, np.nan)
-    np.testing.assert_array_equal(regularisers.output_penalty(spoilt, MASK), found)
+    np.testing.assert_array_equal(regularisers.output_penalty(spoilt, MASK), value)
     assert regularisers.output_penalty(VALUES, NOTHING) == 0
 
 
 @pytest.mark.parametrize("target", [0.0, 0.7])
 @pytest.mark.parametrize("mask", [MASK, ~NOTHING])
 def test_the_gradient_penalty_and_its_gradient_are_those_of_a_known_function(mask, target):
-    found = penalty(SLOPES, mask, target)
-    np.testing.assert_allclose(found, reference_penalty(SLOPES, mask, target), rtol=1e-5)
+    value = penalty(SLOPES, mask, target)
+    np.testing.assert_allclose(value, reference_penalty(SLOPES, mask, target), rtol=1e-5)
     expected = reference.gradient(lambda weight: reference_penalty(weight, mask, target), SLOPES)
     np.testing.assert_allclose(
         penalty_gradient(SLOPES, mask, target), expected, rtol=1e-4, atol=1e-6
@@ -86,17 +86,17 @@ def test_interpolation_draws_one_uniform_place_for_all_leaves_of_a_pair():
     demonstrations = RNG.normal(size=(3000, 2)), RNG.normal(size=(3000, 1)), RNG.normal(size=3000)
     background = tuple(RNG.normal(size=(2000, *leaf.shape[1:])) for leaf in demonstrations)
     demonstrations, background = jax.tree.map(np.float32, (demonstrations, background))
-    found = regularisers.interpolate(KEY, demonstrations, background)
+    points = regularisers.interpolate(KEY, demonstrations, background)
     ends = [
         np.column_stack([leaf[:2000] for leaf in batch]) for batch in (demonstrations, background)
     ]
     way = np.float64(ends[0]) - ends[1]
-    share = np.sum((np.column_stack(found) - ends[1]) * way, axis=1) / np.sum(way**2, axis=1)
-    np.testing.assert_allclose(np.column_stack(found), ends[1] + share[:, None] * way, atol=1e-5)
+    share = np.sum((np.column_stack(points) - ends[1]) * way, axis=1) / np.sum(way**2, axis=1)
+    np.testing.assert_allclose(np.column_stack(points), ends[1] + share[:, None] * way, atol=1e-5)
     assert scipy.stats.kstest(share, "uniform").pvalue > 1e-3
     again = regularisers.interpolate(jax.random.key(1), background, demonstrations)
     assert [leaf.shape for leaf in again] == [leaf.shape for leaf in background]
-    assert not np.array_equal(again[2], found[2])
+    assert not np.array_equal(again[2], points[2])
 
 
 OUTPUTS = np.float32([-1e4, -3.0, -0.2, -0.05, 0.0, 0.05, 0.2, 3.0, 1e4])
@@ -121,32 +121,32 @@ def test_no_output_leaves_the_bounds(kind):
     assert np.abs(bounded(OUTPUTS, bound, kind)).max() <= bound
 
 
-def test_gauges_read_what_the_masks_leave():
+def test_gauges_ignore_masked_entries():
     demonstrated, sampled = (VALUES, MASK), (2.0 * VALUES + 1.0, ~MASK)
     assert gauge_offset("none", demonstrated, sampled) == 0
-    found = gauge_offset("zero-mean", demonstrated, sampled)
-    np.testing.assert_allclose(found, np.mean(np.float64(sampled[0][~MASK])), rtol=1e-6)
+    offset = gauge_offset("zero-mean", demonstrated, sampled)
+    np.testing.assert_allclose(offset, np.mean(np.float64(sampled[0][~MASK])), rtol=1e-6)
     lowered = np.where(MASK, VALUES, 100.0), MASK
     assert gauge_offset("demonstration-maximum", lowered, sampled) == VALUES[MASK].max()
     below_zero = VALUES - 10.0, MASK
-    found = gauge_offset("demonstration-maximum", below_zero, sampled)
-    assert found == (VALUES - np.float32(10.0))[MASK].max()
+    offset = gauge_offset("demonstration-maximum", below_zero, sampled)
+    assert offset == (VALUES - np.float32(10.0))[MASK].max()
 
 
 @pytest.mark.parametrize("kind", ["none", "zero-mean", "demonstration-maximum"])
-def test_without_samples_a_gauge_takes_nothing_off(kind):
+def test_without_samples_a_gauge_is_zero(kind):
     assert gauge_offset(kind, (VALUES, NOTHING), (VALUES, NOTHING)) == 0
 
 
 def test_the_absorbing_state_earns_its_reward_for_ever():
     for_ever = sum(0.95**step * -0.3 for step in range(1, 2000))
     terminated = np.array([False, True, False, True])
-    found = regularisers.absorbed_reward(jnp.float32(-0.3), terminated, 0.95)
-    np.testing.assert_allclose(found, np.where(terminated, for_ever, 0.0), rtol=1e-5)
+    reward = regularisers.absorbed_reward(jnp.float32(-0.3), terminated, 0.95)
+    np.testing.assert_allclose(reward, np.where(terminated, for_ever, 0.0), rtol=1e-5)
 
 
-def test_a_masked_mean_is_that_of_what_is_left():
+def test_a_masked_mean_ignores_masked_entries():
     grid, mask = VALUES.reshape(2, 3), MASK.reshape(2, 3)
-    found = regularisers.masked_mean(grid, mask)
-    np.testing.assert_allclose(found, np.mean(np.float64(grid[mask])), rtol=1e-6)
+    mean = regularisers.masked_mean(grid, mask)
+    np.testing.assert_allclose(mean, np.mean(np.float64(grid[mask])), rtol=1e-6)
     assert regularisers.masked_mean(grid, np.zeros_like(mask)) == 0

@@ -32,8 +32,8 @@ def test_nothing_is_kept_that_nothing_needs():
     }
     for (weights, objective), kept in needs.items():
         state = jax.eval_shape(made(weights, objective).init, KEY, ACTOR, POOL, SUBSET)
-        found = [None if part is None else type(part) for part in (state.source, state.weights)]
-        assert tuple(found) == kept
+        types = [None if part is None else type(part) for part in (state.source, state.weights)]
+        assert tuple(types) == kept
 
 
 def test_seeds_in_step_keep_their_own():

@@ -48,15 +48,15 @@ def test_radial_basis_functions_share_one_and_vary_by_the_action(spec):
     features = rewards.radial_basis(spec, 4)
     observation = np.array([[-1.2, -0.07], [-0.3, 0.0], [0.6, 0.07]], np.float32)
     action = np.array([[0.5], [-1.0], [0.0]], np.float32)
-    found = np.asarray(features(observation, action)).reshape(3, 16, 3)
+    values = np.asarray(features(observation, action)).reshape(3, 16, 3)
     of_action = np.hstack([np.ones((3, 1)), action, action**2])
-    np.testing.assert_allclose(found.sum(axis=1), of_action, rtol=1e-5)
+    np.testing.assert_allclose(values.sum(axis=1), of_action, rtol=1e-5)
     # The centres run over the bounds, the last dimension fastest.
-    assert found[0, :, 0].argmax() == 0
-    assert found[2, :, 0].argmax() == 15
+    assert values[0, :, 0].argmax() == 0
+    assert values[2, :, 0].argmax() == 15
     distance = np.array([[x, y] for x in range(4) for y in range(4)]) - 1.5
     weight = np.exp(-0.5 * np.square(distance).sum(axis=1))
-    np.testing.assert_allclose(found[1, :, 0], weight / weight.sum(), rtol=1e-4)
+    np.testing.assert_allclose(values[1, :, 0], weight / weight.sum(), rtol=1e-4)
 
 
 def test_radial_basis_functions_of_states_ignore_the_action(skewed_spec):
@@ -77,8 +77,8 @@ def test_fourier_is_konidariss_basis(skewed_spec, inputs):
         [np.cos(np.pi * np.dot(c, row)) for c in itertools.product(range(3), repeat=len(row))]
         for row in x
     ]
-    found = rewards.fourier(skewed_spec, 2, inputs)(observation, action)
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    features = rewards.fourier(skewed_spec, 2, inputs)(observation, action)
+    np.testing.assert_allclose(features, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("inputs", ["state-action", "state"])
@@ -90,8 +90,8 @@ def test_a_linear_reward_is_theta_times_the_features(skewed_spec, features, inpu
     values = np.float64(phi(observation, action))
     np.testing.assert_array_equal(network.init(jax.random.key(0)), np.zeros(values.shape[-1]))
     theta = np.random.default_rng(1).normal(size=values.shape[-1])
-    found = jax.jit(network.apply)(np.float32(theta), observation, action)
-    np.testing.assert_allclose(found, values @ theta, rtol=1e-4, atol=1e-4)
+    reward = jax.jit(network.apply)(np.float32(theta), observation, action)
+    np.testing.assert_allclose(reward, values @ theta, rtol=1e-4, atol=1e-4)
 
 
 def test_features_need_resolution_and_finite_bounds(spec):

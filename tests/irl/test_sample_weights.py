@@ -51,8 +51,8 @@ def half_and_half(first, second):
     return np.logaddexp(first, second) - np.log(2.0)
 
 
-def assert_close(found, expected):
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+def assert_close(actual, expected):
+    np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_the_demonstrator_is_fitted_to_the_subsets_pairs_alone():
@@ -60,7 +60,7 @@ def test_the_demonstrator_is_fitted_to_the_subsets_pairs_alone():
     own = np.r_[10:15, 0:6, 21:24]
     pairs = np.c_[np.ones(14), np.float64(POOL.observation[own])]
     slopes, squares, *_ = np.linalg.lstsq(pairs, np.float64(POOL.action[own]))
-    # Drawn with replacement: as near as 1024 pairs come to the fourteen.
+    # 1024 pairs are drawn with replacement from fourteen, so the fit is approximate.
     mean = np.float64(POOL.observation[own]) @ fitted.coefficients[1:] + fitted.coefficients[0]
     np.testing.assert_allclose(mean, pairs @ slopes, atol=0.15)
     np.testing.assert_allclose(fitted.scale, np.sqrt(squares / 14), rtol=0.1)
@@ -82,7 +82,7 @@ def test_snapshots_are_the_latest_ones_of_every_period(steps):
     taken = range(0, steps, PERIOD)[-SNAPSHOTS:]
     expected = [actor_at(step) for step in taken]
     expected += [jax.tree.map(np.zeros_like, ACTOR)] * (SNAPSHOTS - len(taken))
-    found = [jax.tree.map(lambda leaf, slot=slot: leaf[slot], snapshots) for slot in range(3)]
+    kept = [jax.tree.map(lambda leaf, slot=slot: leaf[slot], snapshots) for slot in range(3)]
 
     def as_sorted(trees):
         rows = [
@@ -90,7 +90,7 @@ def test_snapshots_are_the_latest_ones_of_every_period(steps):
         ]
         return np.array(sorted(map(tuple, rows)))
 
-    np.testing.assert_allclose(as_sorted(found), as_sorted(expected), rtol=1e-6)
+    np.testing.assert_allclose(as_sorted(kept), as_sorted(expected), rtol=1e-6)
 
 
 @pytest.mark.parametrize("append", [False, True])
@@ -108,7 +108,7 @@ def test_fused_densities_are_the_mixtures_of_a_brute_force(steps, append):
 
 @pytest.mark.parametrize("steps", [8, STEPS])
 def test_a_snapshot_explores_as_it_did_when_it_was_taken(steps):
-    """A falling epsilon is another one in each component of the mixture."""
+    """Epsilon falls, so each component of the mixture has its own."""
     _, sampled = take("fusion", append=False, steps=steps, behaviour="epsilon-greedy")
     transition = sampled.transition
     action, observation = np.float64(transition.action), scaled(transition.observation)

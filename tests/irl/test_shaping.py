@@ -8,7 +8,7 @@ from tests.support import mdps
 R_E, R_D = np.float32([-0.1, 100.0, 0.0]), np.float32([0.1, -0.05, 0.02])
 
 
-def test_rewards_add_up():
+def test_additive_is_the_sum():
     np.testing.assert_allclose(shaping.additive(R_E, R_D), R_E + R_D)
 
 
@@ -25,7 +25,7 @@ def decision_process(seed):
 
 
 def optimal_q(dynamics, reward, absorbing, discount=0.9):
-    """Hard value iteration on rewards `[S, A, S]` of transitions; nothing follows the end."""
+    """Hard value iteration on rewards `[S, A, S]` of transitions; absorbing states have value 0."""
     q = np.zeros(reward.shape[:2])
     for _ in range(400):
         after = np.where(absorbing, 0.0, q.max(axis=1))
@@ -38,13 +38,12 @@ def shaped(reward, potential, terminated, weight=1.0):
         arrays = np.broadcast_arrays(
             reward[:, :, None], potential[:, None, None], potential, terminated
         )
-        found = shaping.potential(*arrays, 0.9, weight)
-        return np.asarray(found)
+        return np.asarray(shaping.potential(*arrays, 0.9, weight))
 
 
 @pytest.mark.parametrize("weight", [1.0, 0.3])
 @pytest.mark.parametrize("seed", range(5))
-def test_a_potential_leaves_the_optimal_policy_and_takes_itself_off_q(seed, weight):
+def test_a_potential_keeps_the_optimal_policy_and_lowers_q_by_itself(seed, weight):
     dynamics, reward, absorbing, potential = decision_process(seed)
     before = optimal_q(dynamics, np.repeat(reward[:, :, None], 6, axis=2), absorbing)
     after = optimal_q(dynamics, shaped(reward, potential, absorbing, weight), absorbing)
@@ -54,7 +53,7 @@ def test_a_potential_leaves_the_optimal_policy_and_takes_itself_off_q(seed, weig
     assert (before.argmax(axis=1) == after.argmax(axis=1))[runs].all()
 
 
-def test_a_potential_past_the_end_would_change_it():
+def test_a_potential_after_termination_would_change_the_optimal_policy():
     dynamics, reward, absorbing, potential = decision_process(0)
     potential[-1] = 10.0
     zeroed, kept = (
@@ -66,8 +65,8 @@ def test_a_potential_past_the_end_would_change_it():
 
 def test_a_truncation_keeps_its_potential():
     before, after = np.float32([0.5, 0.5]), np.float32([2.0, 2.0])
-    found = shaping.potential(R_E[:2], before, after, np.array([False, True]), 0.9, 2.0)
-    np.testing.assert_allclose(found, [-0.1 + 2 * (1.8 - 0.5), 100.0 - 1.0], rtol=1e-6)
+    reward = shaping.potential(R_E[:2], before, after, np.array([False, True]), 0.9, 2.0)
+    np.testing.assert_allclose(reward, [-0.1 + 2 * (1.8 - 0.5), 100.0 - 1.0], rtol=1e-6)
 
 
 def test_rewards_of_other_shapes_do_not_broadcast():

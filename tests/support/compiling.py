@@ -1,4 +1,4 @@
-"""How the tests' programs are compiled: most of them for longer than they run."""
+"""How the tests' programs are compiled: quickly, as most of them compile longer than they run."""
 
 import os
 import subprocess

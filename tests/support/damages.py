@@ -1,4 +1,4 @@
-"""What can happen to a file: functions of its bytes, drawn by hypothesis."""
+"""Damages of a file: functions of its bytes, drawn by hypothesis."""
 
 import contextlib
 
@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 @st.composite
 def damages(draw):
-    """Other bytes altogether, a cut, flipped bits, or bytes too many."""
+    """The file is replaced, cut, grown, or has flipped bits."""
     kind = draw(st.sampled_from(["replaced", "cut", "flipped", "grown"]))
     places = draw(st.lists(st.floats(0, 1, exclude_max=True), min_size=1, max_size=4))
     bits, some = draw(st.integers(0, 7)), draw(st.binary(max_size=64))
@@ -30,7 +30,7 @@ def damages(draw):
 
 @contextlib.contextmanager
 def done_to(path, damage):
-    """Damage a file for a while."""
+    """Damage a file, and restore it on leaving."""
     content = path.read_bytes()
     path.write_bytes(damage(content))
     try:
@@ -40,7 +40,7 @@ def done_to(path, damage):
 
 
 def attempt(refusal, function, *arguments):
-    """What a function returns and None, or None and what its refusal says."""
+    """The function's result and None, or None and the message of its refusal."""
     try:
         return function(*arguments), None
     except refusal as error:

@@ -17,7 +17,7 @@ def random_mdp(seed, states=4, actions=3, deterministic=False, absorbing=False):
     ends = None
     if absorbing:
         ends = np.arange(states) == states - 1
-        # Likely enough from everywhere that episodes end soon.
+        # Every state leads there with probability 1/2 or more, so that episodes end soon.
         dynamics[:, 0] = 0.5 * dynamics[:, 0] + 0.5 * np.eye(states)[-1]
         if deterministic:
             dynamics[:, 0] = np.eye(states)[-1]
@@ -25,7 +25,7 @@ def random_mdp(seed, states=4, actions=3, deterministic=False, absorbing=False):
 
 
 def sparse(dynamics):
-    """The same dynamics, every state listed as a successor, in another order and split in two."""
+    """The same dynamics with every state as a successor, listed twice and in another order."""
     states, actions, _ = dynamics.shape
     order = np.random.default_rng(0).permutation(np.repeat(np.arange(states), 2))
     next_state = np.broadcast_to(order, (states, actions, 2 * states)).astype(np.int32)

@@ -34,14 +34,14 @@ def gradient(loss, params, step=1e-6):
         moved[leaf_index][position] += offset
         return loss(jax.tree.unflatten(structure, moved))
 
-    found = []
+    slopes_by_leaf = []
     for leaf_index, leaf in enumerate(leaves):
         slopes = np.zeros_like(leaf)
         for position in np.ndindex(leaf.shape):
             rise = at(leaf_index, position, step) - at(leaf_index, position, -step)
             slopes[position] = rise / (2 * step)
-        found.append(slopes)
-    return jax.tree.unflatten(structure, found)
+        slopes_by_leaf.append(slopes)
+    return jax.tree.unflatten(structure, slopes_by_leaf)
 
 
 def base_measure(spec, n=200, *, atoms=True):

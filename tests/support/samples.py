@@ -2,6 +2,7 @@
 
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -122,8 +123,8 @@ def take(weights, objective="visitation", append=True, draws=DRAWS, **kwargs):
     return samples.take(state, POOL, SUBSET, stored, noise, draws)
 
 
-def assert_equal(found, expected):
-    jax.tree.map(np.testing.assert_array_equal, found, expected)
+def assert_equal(actual, expected):
+    chex.assert_trees_all_equal(actual, expected)
 
 
 def numbers(batch):

@@ -18,7 +18,7 @@ def mdp(env):
 
 
 def true_steps(env, mdp):
-    """What the environment itself does from every point with every action: `[S - 1, A]`."""
+    """The environment's own step from every point with every action: `[S - 1, A]`."""
 
     def step(observation, action):
         params = env.default_params
@@ -30,7 +30,7 @@ def true_steps(env, mdp):
     )
 
 
-def test_an_observation_is_of_its_state(env):
+def test_state_at_gives_the_state_of_an_observation(env):
     params = env.default_params
     state, observation = env.reset(jax.random.key(0), params)
     for _ in range(5):
@@ -40,13 +40,13 @@ def test_an_observation_is_of_its_state(env):
     assert (again.position, again.velocity, again.time) == (state.position, state.velocity, 0)
 
 
-def test_transitions_are_the_environments(env, mdp):
+def test_transitions_are_those_of_the_environment(env, mdp):
     steps = true_steps(env, mdp)
     index, weight = (np.asarray(leaf)[:-1] for leaf in mdp.dynamics)
     ended = np.asarray(steps.terminated)
     np.testing.assert_allclose(weight.sum(axis=-1), 1.0, rtol=1e-6)
     np.testing.assert_array_equal((index == mdp.states.size).all(axis=-1), ended)
-    # Multilinear weights reproduce the place itself.
+    # Multilinear weights reproduce the observation.
     place = np.einsum(
         "sak,sako->sao", weight[~ended][None], points(mdp.states)[index[~ended]][None]
     )
@@ -71,7 +71,7 @@ def test_subsamples_average_over_the_cell(env, mdp):
     half = mdp.states.spacing / 4
     around = points(mdp.states)[state] + half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
     params = env.default_params
-    found = [
+    steps = [
         env.step(
             jax.random.key(0), env.state_at(place, params), points(mdp.actions)[action], params
         )
@@ -80,7 +80,7 @@ def test_subsamples_average_over_the_cell(env, mdp):
     index, weight = (np.asarray(leaf)[state, action] for leaf in finer.dynamics)
     np.testing.assert_allclose(
         weight @ points(mdp.states)[index],
-        np.mean([step.observation for _, step in found], axis=0),
+        np.mean([step.observation for _, step in steps], axis=0),
         atol=1e-5,
     )
 
@@ -95,7 +95,7 @@ def test_a_hundred_by_a_hundred_cells_with_eleven_actions_fit(env):
 
 @pytest.mark.optimised
 def test_the_discretised_optimum_solves_the_continuous_task(env):
-    """With what it earns there close to what the table says it is worth."""
+    """The discounted return is close to the table's value."""
 
     @jit_as_users
     def solve():
@@ -105,20 +105,20 @@ def test_the_discretised_optimum_solves_the_continuous_task(env):
         )
         params = env.default_params
         act = discretise.greedy(mdp, best.action_values)
-        found = evaluation.rollout(act, env, params, env.starts(50, params))
-        return best, found, discretise.look_up(mdp, best.values, env.starts(50, params)[1])
+        rollouts = evaluation.rollout(act, env, params, env.starts(50, params))
+        return best, rollouts, discretise.look_up(mdp, best.values, env.starts(50, params)[1])
 
-    best, found, promised = solve()
+    best, rollouts, promised = solve()
     assert best.residual <= 1e-6
-    assert found.episode_return.mean() > 93
-    assert found.terminated.all()
-    # What the discount leaves of 100 at the end, less the actions' cost.
-    reached = 100 * 0.99 ** (found.length - 1.0)
+    assert rollouts.episode_return.mean() > 93
+    assert rollouts.terminated.all()
+    # The goal's discounted reward, without the actions' cost.
+    reached = 100 * 0.99 ** (rollouts.length - 1.0)
     assert ((promised > 0.85 * (reached - 6)) & (promised < reached)).all()
 
 
 @pytest.mark.optimised
-def test_soft_policies_are_run_by_drawing(env, mdp):
+def test_stochastic_policies_draw_their_actions(env, mdp):
     uniform = jnp.zeros_like(mdp.reward)
     always_right = jnp.where(jnp.arange(5) == 4, 0.0, -jnp.inf) + uniform
     params = env.default_params

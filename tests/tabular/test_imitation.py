@@ -35,11 +35,11 @@ def test_visitation_counts_discounted_steps_where_they_were(data, mdp, chosen):
     which = range(len(pool.start)) if chosen is None else chosen
     subset = None
     if chosen is not None:
-        # Padded, as a traced number of demonstrations needs.
+        # With padding, as for a traced number of demonstrations.
         start = np.append(np.asarray(pool.start)[chosen], pool.start[1])
         length = np.append(np.asarray(pool.length)[chosen], 0)
         subset = DemonstrationSubset(jnp.asarray(start), jnp.asarray(length))
-    found = jax.jit(lambda subset: imitation.visitation(mdp, data, subset, discount=0.9))(subset)
+    counted = jax.jit(lambda subset: imitation.visitation(mdp, data, subset, discount=0.9))(subset)
     total, place, action, first = 0.0, np.zeros(2), np.zeros(1), np.zeros(2)
     for episode in which:
         begin, steps = int(pool.start[episode]), int(pool.length[episode])
@@ -50,11 +50,11 @@ def test_visitation_counts_discounted_steps_where_they_were(data, mdp, chosen):
         action += weight @ data.transition.action[rows]
         first += data.transition.observation[begin] / len(which)
     grid, levels = points(mdp.states), points(mdp.actions)
-    visits = np.asarray(found.visitation)
+    visits = np.asarray(counted.visitation)
     np.testing.assert_allclose(visits.sum(), total, rtol=1e-5)
     np.testing.assert_allclose(visits[:-1].sum(1) @ grid, place, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(visits.sum(0) @ levels, action, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(found.initial[:-1] @ grid, first, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(counted.initial[:-1] @ grid, first, rtol=1e-4, atol=1e-5)
     assert (visits >= 0).all()
     assert (visits[-1] == 0).all()
 
@@ -70,19 +70,19 @@ def test_every_reward_is_fitted_and_vmaps(data, mdp, kind, reward):
         return imitation.fit(key, mdp, pools.ENV.spec, data, subset, kind=kind, settings=settings)
 
     keys = jax.random.split(jax.random.key(0), 2)
-    found = jax.jit(jax.vmap(fit, in_axes=(0, None, None)))(keys, mdp, data)
-    assert found.reward.shape == (2, 122, 3)
-    spread = np.ptp(np.asarray(found.reward), axis=2).max()
+    result = jax.jit(jax.vmap(fit, in_axes=(0, None, None)))(keys, mdp, data)
+    assert result.reward.shape == (2, 122, 3)
+    spread = np.ptp(np.asarray(result.reward), axis=2).max()
     assert spread == 0 if reward == "state" else spread > 1e-4
-    error = found.info.visitation_error
+    error = result.info.visitation_error
     assert (error[:, -1] < error[:, 0]).all()
-    assert (np.asarray(found.reward[0]) != np.asarray(found.reward[1])).any()
+    assert (np.asarray(result.reward[0]) != np.asarray(result.reward[1])).any()
 
 
 @pytest.mark.optimised
 @pytest.mark.parametrize("kind", ["linear", "deep"])
 def test_the_reward_of_twelve_demonstrations_solves_the_task(kind):
-    """Greedily and softly, from each of 20 start states."""
+    """The greedy policy and the soft one, from each of 20 start states."""
     settings = TabularSettings()
     env, params = pools.ENV, pools.ENV.default_params
     data = hot_start.data(pools.scripted(push=0.6))
@@ -90,14 +90,14 @@ def test_the_reward_of_twelve_demonstrations_solves_the_task(kind):
     @jit_as_users
     def returns(data):
         mdp = imitation.discretised(env, settings)
-        found = imitation.fit(jax.random.key(0), mdp, env.spec, data, kind=kind, settings=settings)
+        result = imitation.fit(jax.random.key(0), mdp, env.spec, data, kind=kind, settings=settings)
         starts = env.starts(20, params)
-        greedy = discretise.greedy(mdp, found.policy.action_values)
+        greedy = discretise.greedy(mdp, result.policy.action_values)
         soft = discretise.sampled(mdp, env)
         return [
             evaluation.rollout(greedy, env, params, starts).episode_return,
             evaluation.rollout(
-                lambda o: discretise.look_up(mdp, found.policy.log_probabilities, o),
+                lambda o: discretise.look_up(mdp, result.policy.log_probabilities, o),
                 soft,
                 params,
                 starts,

@@ -11,11 +11,11 @@ coordinates = st.tuples(*(st.floats(-20, 20, width=32) for _ in range(3)))
 
 
 def test_points_run_over_the_box_with_the_last_dimension_fastest():
-    found = points(GRID)
-    assert found.shape == (GRID.size, 3) == (30, 3)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found[:6, 2], [2, 4, 6, 8, 10, 2])
-    np.testing.assert_allclose(found[[0, -1]], [[-1, 0, 2], [3, 0.5, 10]])
+    grid_points = points(GRID)
+    assert grid_points.shape == (GRID.size, 3) == (30, 3)
+    assert grid_points.dtype == np.float32
+    np.testing.assert_allclose(grid_points[:6, 2], [2, 4, 6, 8, 10, 2])
+    np.testing.assert_allclose(grid_points[[0, -1]], [[-1, 0, 2], [3, 0.5, 10]])
     np.testing.assert_allclose(GRID.spacing, [2, 0.5, 2])
 
 
@@ -31,7 +31,7 @@ def test_weights_reproduce_linear_functions_inside_and_the_border_outside(positi
     )
 
 
-def test_points_are_themselves():
+def test_grid_points_interpolate_to_themselves():
     index, weight = interpolate(GRID, points(GRID))
     heaviest = np.asarray(index)[np.arange(30), np.asarray(weight).argmax(axis=1)]
     np.testing.assert_array_equal(heaviest, np.arange(30))

@@ -22,7 +22,7 @@ def float64():
 
 
 def expert(dynamics, reward, initial, absorbing, discount=0.9, horizon=None):
-    """The visitation of the soft-optimal policy of `reward`, as if of infinitely many episodes."""
+    """The exact visitation of the soft-optimal policy of `reward`."""
     kwargs = {"discount": discount, "horizon": horizon, "absorbing": absorbing}
     policy = tabular.soft_value_iteration(dynamics, jnp.asarray(reward), stop=EXACT, **kwargs)
     visitation = tabular.expected_visitation(
@@ -44,9 +44,9 @@ def test_empirical_visitation_counts():
     state = np.array([[0, 1, 1], [2, 0, 0]])
     action = np.array([[1, 0, 1], [1, 1, 0]])
     mask = np.array([[True, True, True], [True, False, False]])
-    found = tabular.empirical_visitation(state, action, mask, (3, 2), discount=0.5)
-    np.testing.assert_allclose(found.visitation, [[0, 0.5], [0.25, 0.125], [0, 0.5]])
-    np.testing.assert_allclose(found.initial, [0.5, 0, 0.5])
+    counted = tabular.empirical_visitation(state, action, mask, (3, 2), discount=0.5)
+    np.testing.assert_allclose(counted.visitation, [[0, 0.5], [0.25, 0.125], [0, 0.5]])
+    np.testing.assert_allclose(counted.initial, [0.5, 0, 0.5])
 
 
 @pytest.mark.parametrize("temperature", [1.0, 0.5])
@@ -97,9 +97,9 @@ def test_a_reward_of_states_sees_the_sum_over_actions():
     of_states, of_pairs = (
         [
             tabular.maxent_irl(
-                dynamics, features, found, discount=0.9, optimizer=optax.sgd(0.1), steps=1
+                dynamics, features, given, discount=0.9, optimizer=optax.sgd(0.1), steps=1
             ).params
-            for found in (demonstrations, shuffled)
+            for given in (demonstrations, shuffled)
         ]
         for features in (np.eye(4), np.eye(12).reshape(4, 3, 12))
     )
@@ -112,7 +112,7 @@ def test_the_optimum_matches_the_demonstrations_visitation(optimizer):
     dynamics, reward, initial, ends = mdps.random_mdp(2, absorbing=True)
     demonstrations = expert(dynamics, reward, initial, ends)
     features = np.eye(12).reshape(4, 3, 12)
-    found = jax.jit(
+    result = jax.jit(
         lambda: tabular.maxent_irl(
             dynamics,
             features,
@@ -124,9 +124,9 @@ def test_the_optimum_matches_the_demonstrations_visitation(optimizer):
             stop=EXACT,
         )
     )()
-    np.testing.assert_allclose(found.visitation, demonstrations.visitation, atol=1e-4)
-    assert found.info.log_likelihood[-1] >= found.info.log_likelihood.max() - 1e-9
-    assert found.info.visitation_error[-1] < 1e-3 < found.info.visitation_error[0]
+    np.testing.assert_allclose(result.visitation, demonstrations.visitation, atol=1e-4)
+    assert result.info.log_likelihood[-1] >= result.info.log_likelihood.max() - 1e-9
+    assert result.info.visitation_error[-1] < 1e-3 < result.info.visitation_error[0]
 
 
 @pytest.mark.parametrize("slip", [0.0, 0.2])
@@ -162,17 +162,17 @@ def test_the_reward_of_a_gridworld_is_recovered(deep, slip):
         if deep
         else functools.partial(tabular.maxent_irl, features=np.eye(states))
     )
-    found = jax.jit(
+    result = jax.jit(
         lambda: fit(
             dynamics=dynamics, demonstrations=demonstrations, prior_precision=1e-4, **kwargs
         )
     )()
     values = []
-    for policy in (found.policy, ideal):
+    for policy in (result.policy, ideal):
         mu = tabular.expected_visitation(dynamics, policy, jnp.asarray(starts), **kwargs)
         values.append(float(jnp.sum(mu * (truth - policy.log_probabilities))))
     found_value, ideal_value = values
-    # Entropy counts in, so that the expert's value is the greatest there is; both are below zero.
+    # The values include entropy, so that the expert's is the largest; both are negative.
     assert ideal_value / 0.99 <= found_value <= ideal_value < -5.0
 
 
@@ -184,10 +184,10 @@ def test_seeds_vmap():
     keys = jax.random.split(jax.random.key(0), 3)
 
     def fit(key, demonstrations):
-        found = tabular.deep_maxent_irl(
+        result = tabular.deep_maxent_irl(
             key, network, (places,), dynamics, demonstrations, discount=0.9, absorbing=ends, steps=5
         )
-        return found.reward, found.visitation
+        return result.reward, result.visitation
 
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *every)
     together = jax.jit(jax.vmap(fit))(keys, stacked)

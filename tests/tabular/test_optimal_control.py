@@ -17,7 +17,7 @@ def float64():
 @pytest.mark.parametrize("absorbing", [False, True])
 def test_no_deterministic_policy_is_better(absorbing):
     dynamics, reward, _, ends = mdps.random_mdp(0, 3, 2, absorbing=absorbing)
-    found = tabular.value_iteration(
+    optimum = tabular.value_iteration(
         dynamics, jnp.asarray(reward), discount=0.9, absorbing=ends, stop=Stop(1e-14)
     )
     alive = np.ones(3) if ends is None else ~ends
@@ -26,8 +26,8 @@ def test_no_deterministic_policy_is_better(absorbing):
         moves = dynamics[range(3), policy] * alive[:, None]
         value = np.linalg.solve(np.eye(3) - 0.9 * moves, reward[range(3), policy] * alive)
         best = np.maximum(best, value)
-    np.testing.assert_allclose(found.values, best, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(found.action_values, reward + 0.9 * dynamics @ best, rtol=1e-10)
+    np.testing.assert_allclose(optimum.values, best, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(optimum.action_values, reward + 0.9 * dynamics @ best, rtol=1e-10)
 
 
 def test_a_finite_horizon_is_the_limit_of_low_temperature():

@@ -23,7 +23,7 @@ def float64():
         yield
 
 
-# Jitted here, once: without, every call would compile its loops.
+# Jitted once here: otherwise every call would compile its loops.
 soft_value_iteration = jax.jit(tabular.soft_value_iteration, static_argnames="horizon")
 expected_visitation = jax.jit(tabular.expected_visitation, static_argnames="horizon")
 
@@ -41,29 +41,29 @@ def visits(dynamics, policy, initial, **kwargs):
 @pytest.mark.parametrize(("discount", "temperature"), [(1.0, 1.0), (0.7, 0.3), (0.95, 2.0)])
 def test_values_and_policy_follow_the_recursion(discount, temperature, absorbing):
     dynamics, reward, _, ends = mdps.random_mdp(0, absorbing=absorbing)
-    found = soft(
+    solution = soft(
         dynamics, reward, discount=discount, horizon=5, temperature=temperature, absorbing=ends
     )
     values, policy = mdps.soft_backups(dynamics, reward, discount, 5, temperature, ends)
-    np.testing.assert_allclose(found.values, values, rtol=1e-12)
-    np.testing.assert_allclose(np.exp(found.log_probabilities), policy, rtol=1e-12)
+    np.testing.assert_allclose(solution.values, values, rtol=1e-12)
+    np.testing.assert_allclose(np.exp(solution.log_probabilities), policy, rtol=1e-12)
     following = np.concatenate([values[1:], np.zeros((1, len(reward)))])
     q = reward + discount * np.einsum("sat,ht->hsa", dynamics, following)
-    np.testing.assert_allclose(found.action_values, q, rtol=1e-12)
-    assert found.residual == 0
+    np.testing.assert_allclose(solution.action_values, q, rtol=1e-12)
+    assert solution.residual == 0
 
 
 def test_the_value_sums_over_all_paths():
     """Undiscounted and deterministic: V_0(s) = log sum over paths of exp(their return)."""
     dynamics, reward, _, _ = mdps.random_mdp(1, deterministic=True)
-    found = soft(dynamics, reward, discount=1.0, horizon=4)
+    solution = soft(dynamics, reward, discount=1.0, horizon=4)
     uniform = np.ones((4, *reward.shape))
     for state in range(len(reward)):
         paths = mdps.trajectories(dynamics, uniform, np.eye(len(reward))[state])
         total = sum(
             np.exp(sum(reward[pair] for pair in pairs)) for weight, pairs in paths if weight
         )
-        np.testing.assert_allclose(found.values[0, state], np.log(total), rtol=1e-12)
+        np.testing.assert_allclose(solution.values[0, state], np.log(total), rtol=1e-12)
 
 
 @pytest.mark.parametrize("absorbing", [False, True])
@@ -72,10 +72,10 @@ def test_the_value_sums_over_all_paths():
 def test_visitation_equals_the_sum_over_all_trajectories(discount, deterministic, absorbing):
     dynamics, reward, initial, ends = mdps.random_mdp(2, 3, 2, deterministic, absorbing)
     policy = soft(dynamics, reward, discount=discount, horizon=5, absorbing=ends)
-    found = visits(dynamics, policy, initial, discount=discount, horizon=5, absorbing=ends)
+    visited = visits(dynamics, policy, initial, discount=discount, horizon=5, absorbing=ends)
     every = mdps.trajectories(dynamics, np.exp(policy.log_probabilities), initial, ends)
     expected = mdps.counted_visits(every, discount, reward.shape)
-    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(visited, expected, rtol=1e-10, atol=1e-14)
 
 
 @pytest.mark.parametrize("absorbing", [False, True])
@@ -87,8 +87,8 @@ def test_fixed_points_equal_matrix_solves(absorbing):
         probabilities[ends] = 0.0
     moves = np.einsum("sa,sat->st", probabilities, dynamics)
     occupancy = np.linalg.solve(np.eye(6) - 0.9 * moves.T, initial)
-    found = visits(dynamics, policy, initial, absorbing=ends)
-    np.testing.assert_allclose(found, occupancy[:, None] * probabilities, rtol=1e-10)
+    visited = visits(dynamics, policy, initial, absorbing=ends)
+    np.testing.assert_allclose(visited, occupancy[:, None] * probabilities, rtol=1e-10)
     # The policy's own value: its rewards and its entropy.
     entropy = -np.sum(probabilities * policy.log_probabilities, axis=1)
     value = np.linalg.solve(
@@ -101,12 +101,14 @@ def test_fixed_points_equal_matrix_solves(absorbing):
 @given(st.integers(0, 1000), st.booleans(), st.sampled_from([None, 3]))
 def test_sparse_equals_dense(seed, absorbing, horizon):
     dynamics, reward, initial, ends = mdps.random_mdp(seed, absorbing=absorbing)
-    found = []
+    solutions = []
     with jax.enable_x64(True):
         for kind in (dynamics, mdps.sparse(dynamics)):
             policy = soft(kind, reward, horizon=horizon, absorbing=ends)
-            found.append((policy, visits(kind, policy, initial, horizon=horizon, absorbing=ends)))
-    chex.assert_trees_all_close(*found, rtol=1e-9, atol=1e-12)
+            solutions.append(
+                (policy, visits(kind, policy, initial, horizon=horizon, absorbing=ends))
+            )
+    chex.assert_trees_all_close(*solutions, rtol=1e-9, atol=1e-12)
 
 
 def likelihood(dynamics, demonstrations, reward, discount, **kwargs):
@@ -122,7 +124,7 @@ def likelihood(dynamics, demonstrations, reward, discount, **kwargs):
 
 
 def demonstrate(dynamics, starts, length, ends, seed):
-    """One demonstration per start, by a policy that is no optimum of anything."""
+    """One demonstration per start, by a policy that is optimal for no reward."""
     rng = np.random.default_rng(seed)
     states, actions, _ = dynamics.shape
     for state in starts:
@@ -203,10 +205,10 @@ def test_fixed_points_are_differentiable(mode):
     jax.test_util.check_grads(measure, (jnp.asarray(reward),), order=1, modes=[mode], rtol=1e-6)
 
 
-def test_the_iteration_stops_at_its_bound_and_says_so():
+def test_reaching_the_limit_on_iterations_shows_in_the_residual():
     dynamics, reward, _, _ = mdps.random_mdp(8)
-    found = soft(dynamics, reward, discount=0.999, stop=Stop(1e-14, iterations=20))
-    assert 1e-4 < found.residual < 1.0
+    solution = soft(dynamics, reward, discount=0.999, stop=Stop(1e-14, iterations=20))
+    assert 1e-4 < solution.residual < 1.0
 
 
 def test_a_good_guess_is_not_iterated_further():

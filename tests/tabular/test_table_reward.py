@@ -15,8 +15,8 @@ def test_the_reward_is_the_scaled_table_at_the_grids_points():
     state = table_reward.state(jnp.asarray(TABLE), IRLHParams(bound=0.2))
     observation = np.repeat(interpolation.points(STATES)[:, None], 3, axis=1)
     action = np.broadcast_to(interpolation.points(ACTIONS), (30, 3, 1))
-    found = LEARNER.reward(state, observation, action)
-    np.testing.assert_allclose(found, 0.2 * TABLE / np.abs(TABLE).max(), atol=1e-5)
+    reward = LEARNER.reward(state, observation, action)
+    np.testing.assert_allclose(reward, 0.2 * TABLE / np.abs(TABLE).max(), atol=1e-5)
 
 
 def test_between_the_points_it_is_linear_in_the_action():
