@@ -247,7 +247,7 @@ def _update(
     state, policy_loss = _when(
         update_actor,
         lambda state: _update_actor(parts, state, batch, demonstrations, clone),
-        lambda state: (state, jnp.zeros(())),
+        lambda state: (state, jnp.zeros((), jnp.float32)),
         state,
     )
     state = _when(update_targets, _move_targets, lambda state: state, state)
@@ -287,7 +287,7 @@ def _update_actor(
             lambda actor: jax.value_and_grad(behaviour_cloning_loss, argnums=1)(
                 parts.networks, actor, state.critic, state.hparams, demonstrations
             ),
-            lambda actor: (jnp.zeros(()), jax.tree.map(jnp.zeros_like, actor)),
+            lambda actor: (jnp.zeros((), jnp.float32), jax.tree.map(jnp.zeros_like, actor)),
             actor,
         )
         loss, grads = jax.tree.map(jnp.add, (loss, grads), (cloning_loss, cloning_grads))

@@ -141,7 +141,7 @@ def fit_gaussian(
         action: `[N, A]`.
         weight: `[N]`, of each pair, not all zero; default equal.
     """
-    weight = jnp.ones(len(observation)) if weight is None else weight
+    weight = jnp.ones(len(observation), jnp.float32) if weight is None else weight
     mean, action_mean = (jnp.average(x, 0, weight) for x in (observation, action))
     spread = jnp.sqrt(jnp.average(jnp.square(observation - mean), 0, weight))
     # Constant features carry only rounding error: do not rescale them.

@@ -135,7 +135,7 @@ def gaussian(spec: EnvSpec, hparams: GaussianHParams | None = None) -> Explorati
         spec,
         init=lambda key: traced(initial),
         reset=lambda state: state,
-        draw=lambda key: jax.random.normal(key, (spec.action_dim,)),
+        draw=lambda key: jax.random.normal(key, (spec.action_dim,), jnp.float32),
         perturb=functools.partial(_perturb_gaussian, spec),
         log_density=functools.partial(_gaussian_log_density, spec),
     )
@@ -192,9 +192,11 @@ def ornstein_uhlenbeck(
     initial = hparams or OrnsteinUhlenbeckHParams()
     return behaviour.assemble(
         spec,
-        init=lambda key: OrnsteinUhlenbeckState(jnp.zeros(spec.action_dim), traced(initial)),
+        init=lambda key: OrnsteinUhlenbeckState(
+            jnp.zeros(spec.action_dim, jnp.float32), traced(initial)
+        ),
         reset=lambda state: state.replace(value=jnp.zeros_like(state.value)),
-        draw=lambda key: jax.random.normal(key, (spec.action_dim,)),
+        draw=lambda key: jax.random.normal(key, (spec.action_dim,), jnp.float32),
         perturb=functools.partial(_perturb_ornstein_uhlenbeck, spec),
         log_density=functools.partial(_ornstein_uhlenbeck_log_density, spec),
     )
@@ -289,7 +291,7 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
     return behaviour.assemble(
         spec,
         init=lambda key: HeldActionState(
-            jnp.zeros(spec.action_dim), jnp.zeros(()), traced(initial)
+            jnp.zeros(spec.action_dim, jnp.float32), jnp.zeros((), jnp.float32), traced(initial)
         ),
         reset=lambda state: state.replace(remaining=jnp.zeros_like(state.remaining)),
         draw=functools.partial(_draw_epsilon_greedy, spec, initial.noise is not None),
@@ -300,9 +302,9 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
 
 def _draw_epsilon_greedy(spec: EnvSpec, noisy: bool, key: jax.Array) -> _Noise:
     keys = jax.random.split(key, 3 if noisy else 2)
-    choice = jax.random.uniform(keys[0])
+    choice = jax.random.uniform(keys[0], dtype=jnp.float32)
     action = jax.random.uniform(
-        keys[1], (spec.action_dim,), minval=spec.action_low, maxval=spec.action_high
+        keys[1], (spec.action_dim,), jnp.float32, minval=spec.action_low, maxval=spec.action_high
     )
     if not noisy:
         return _Noise(choice, action, None)
@@ -310,7 +312,7 @@ def _draw_epsilon_greedy(spec: EnvSpec, noisy: bool, key: jax.Array) -> _Noise:
     low, high = spec.action_low, spec.action_high
     margin = np.finfo(np.float32).eps * np.maximum(np.abs(low), np.abs(high))
     action = jnp.clip(action, low + margin, high - margin)
-    return _Noise(choice, action, jax.random.normal(keys[2], (spec.action_dim,)))
+    return _Noise(choice, action, jax.random.normal(keys[2], (spec.action_dim,), jnp.float32))
 
 
 def _perturb_epsilon_greedy(

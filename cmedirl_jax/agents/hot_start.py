@@ -176,7 +176,7 @@ def critic_loss(
     cells = jnp.asarray(action_cells(spec, hparams.cells))
     half_width = 0.5 * (spec.action_high - spec.action_low)
     squared_distance = jnp.sum(jnp.square((cells - action[:, None, :]) / half_width), axis=-1)
-    nearest = jax.nn.one_hot(jnp.argmin(squared_distance, axis=-1), len(cells))
+    nearest = jax.nn.one_hot(jnp.argmin(squared_distance, axis=-1), len(cells), dtype=jnp.float32)
     actions = jnp.broadcast_to(cells, (*squared_distance.shape, spec.action_dim))
     if hparams.critic in ("one-hot", "large-margin"):
         actions = jnp.where(nearest[..., None] > 0, action[:, None, :], actions)

@@ -96,7 +96,7 @@ def sample_index(key: jax.Array, subset: DemonstrationSubset, batch_size: int) -
     checks.counts(batch_size=batch_size)
     subset = jax.tree.map(jnp.asarray, subset)
     ends = jnp.cumsum(subset.length)
-    step = jax.random.randint(key, (batch_size,), 0, ends[-1])
+    step = jax.random.randint(key, (batch_size,), 0, ends[-1], jnp.int32)
     which = jnp.searchsorted(ends, step, side="right")
     offset = step - (ends[which] - subset.length[which])
     return subset.start[which] + offset
@@ -133,7 +133,7 @@ def sample_episodes(key: jax.Array, subset: DemonstrationSubset, count: int) -> 
     """
     _check_subset(subset)
     checks.counts(count=count)
-    return jax.random.randint(key, (count,), 0, jnp.sum(jnp.asarray(subset.length) > 0))
+    return jax.random.randint(key, (count,), 0, jnp.sum(jnp.asarray(subset.length) > 0), jnp.int32)
 
 
 def _check_subset(subset: DemonstrationSubset) -> None:

@@ -86,7 +86,7 @@ def make(spec: EnvSpec, capacity: int) -> Replay:
 
 
 def _init(spec: EnvSpec, capacity: int) -> ReplayState:
-    return ReplayState(jnp.zeros((capacity, row_size(spec))), jnp.zeros((), jnp.int32))
+    return ReplayState(jnp.zeros((capacity, row_size(spec)), jnp.float32), jnp.zeros((), jnp.int32))
 
 
 def _add(spec: EnvSpec, capacity: int, state: ReplayState, transition: Transition) -> ReplayState:

@@ -81,13 +81,17 @@ def make() -> Env:
 
 def reset(key: jax.Array, params: MountainCarParams) -> tuple[MountainCarState, jax.Array]:
     """Start at rest, at a position drawn from U(start_low, start_high)."""
-    position = jax.random.uniform(key, minval=params.start_low, maxval=params.start_high)
+    position = jax.random.uniform(
+        key, dtype=jnp.float32, minval=params.start_low, maxval=params.start_high
+    )
     return _at_rest(position)
 
 
 def starts(count: int, params: MountainCarParams) -> tuple[MountainCarState, jax.Array]:
     """`count` start states at rest, evenly spaced over the start interval, its ends included."""
-    return jax.vmap(_at_rest)(jnp.linspace(params.start_low, params.start_high, count))
+    return jax.vmap(_at_rest)(
+        jnp.linspace(params.start_low, params.start_high, count, dtype=jnp.float32)
+    )
 
 
 def step(

@@ -104,7 +104,7 @@ def learn_nothing(
 
 def no_info() -> RewardInfo:
     """The diagnostics of a step without an update: zeros."""
-    return RewardInfo(*(jnp.zeros(()) for _ in RewardInfo._fields))
+    return RewardInfo(*(jnp.zeros((), jnp.float32) for _ in RewardInfo._fields))
 
 
 def pairs(spec: EnvSpec, batch: Transition | RewardBatch, name: str) -> RewardBatch:
@@ -133,7 +133,9 @@ def _checked(
     transition = batch.transition if isinstance(batch, RewardBatch) else batch
     leading = jnp.shape(transition.observation)[: len(axes)]
     if not isinstance(batch, RewardBatch):
-        batch = RewardBatch(transition, jnp.zeros(leading[:1]), jnp.ones(leading, bool))
+        batch = RewardBatch(
+            transition, jnp.zeros(leading[:1], jnp.float32), jnp.ones(leading, bool)
+        )
     expected = [
         ("observations", transition.observation, (*leading, spec.observation_dim)),
         ("actions", transition.action, (*leading, spec.action_dim)),

@@ -101,4 +101,4 @@ def _bounds(spec: EnvSpec) -> tuple[np.ndarray, ...]:
 
 
 def _uniform(key: jax.Array, low: np.ndarray, high: np.ndarray) -> jax.Array:
-    return jax.random.uniform(key, (PROBES, len(low)), minval=low, maxval=high)
+    return jax.random.uniform(key, (PROBES, len(low)), jnp.float32, minval=low, maxval=high)

@@ -138,7 +138,7 @@ def _update(
         demonstration_reward=regularisers.masked_mean(r_d, demonstrated.mask),
         background_reward=regularisers.masked_mean(r_b, sampled.mask),
         log_likelihood=evaluation.log_likelihood,
-        log_prior=jnp.zeros(()),
+        log_prior=jnp.zeros((), jnp.float32),
         gradient_norm=optax.tree.norm(gradient),
         effective_sample_size=jnp.sum(sampled.mask).astype(evaluation.log_likelihood.dtype),
     )

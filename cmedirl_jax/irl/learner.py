@@ -156,8 +156,8 @@ class _Evaluation(NamedTuple):
 
 
 def _init(parts: _Parts, hparams: IRLHParams, key: jax.Array) -> RewardState:
-    absorbing = jnp.zeros(()) if hparams.absorbing else None
-    params = RewardParams(parts.network.init(key), jnp.zeros(()), absorbing)
+    absorbing = jnp.zeros((), jnp.float32) if hparams.absorbing else None
+    params = RewardParams(parts.network.init(key), jnp.zeros((), jnp.float32), absorbing)
     return RewardState(params, parts.optimizer.init(_learned(params)), traced(hparams))
 
 

@@ -177,7 +177,8 @@ def score_trajectories(
 def returns(reward: jax.Array, mask: jax.Array, discount: Numeric = 1.0) -> jax.Array:
     """R(tau) = sum_t discount^t r_t over the steps of `mask`: `[..., T]` -> `[...]`."""
     steps = jnp.arange(reward.shape[-1])
-    return jnp.sum(jnp.where(mask, discount**steps * reward, 0.0), axis=-1)
+    weight = jnp.asarray(discount**steps, reward.dtype)
+    return jnp.sum(jnp.where(mask, weight * reward, 0.0), axis=-1)
 
 
 def weighed(
@@ -233,7 +234,7 @@ def _log_partition_likelihood(
     exponent, counts = samples.reward + samples.log_weight, _counts(samples)
     some = jnp.any(counts)
     log_sum = jax.nn.logsumexp(jnp.where(some, exponent, 0.0), where=counts | ~some)
-    log_mean = log_sum - jnp.log(jnp.maximum(jnp.sum(samples.mask), 1))
+    log_mean = log_sum - jnp.log(jnp.maximum(jnp.sum(samples.mask), 1).astype(log_sum.dtype))
     weight = _normalised(exponent, counts)
     return _likelihood(_mean(demonstrations) - log_mean, weight, some)
 

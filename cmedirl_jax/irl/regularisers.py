@@ -70,7 +70,7 @@ def interpolate(key: jax.Array, demonstrations: Any, background: Any) -> Any:
         A pytree with leaves `[min(D, B), ...]`.
     """
     size = min(jax.tree.leaves(tree)[0].shape[0] for tree in (demonstrations, background))
-    share = jax.random.uniform(key, (size,))
+    share = jax.random.uniform(key, (size,), jnp.float32)
 
     def between(demonstrated: jax.Array, sampled: jax.Array) -> jax.Array:
         weight = share.reshape(size, *(1,) * (demonstrated.ndim - 1))
@@ -114,7 +114,7 @@ def gauge_offset(
     """
     match kind:
         case "none":
-            return jnp.zeros(())
+            return jnp.zeros((), jnp.float32)
         case "zero-mean":
             return masked_mean(*background)
         case "demonstration-maximum":

@@ -127,7 +127,7 @@ def linear(spec: EnvSpec, features: Features) -> Network:
     """
     size = jax.eval_shape(features, spec.observation_low, spec.action_low).shape[-1]
     return Network(
-        init=lambda key: jnp.zeros(size),
+        init=lambda key: jnp.zeros(size, jnp.float32),
         apply=lambda theta, observation, action: features(observation, action) @ theta,
     )
 
@@ -148,7 +148,8 @@ def radial_basis(spec: EnvSpec, centres: int, inputs: Inputs = "state-action") -
     scale = networks.observation_scaling(spec)
     axis = np.linspace(-1.0, 1.0, centres)
     grid = grids.product(*[axis] * spec.observation_dim)
-    return functools.partial(_radial_basis, spec, inputs, scale, grid, axis[1] - axis[0])
+    width = np.float32(axis[1] - axis[0])
+    return functools.partial(_radial_basis, spec, inputs, scale, np.float32(grid), width)
 
 
 def _radial_basis(
@@ -156,7 +157,7 @@ def _radial_basis(
     inputs: Inputs,
     scale: Callable[[jax.Array], jax.Array],
     grid: np.ndarray,
-    width: float,
+    width: np.float32,
     observation: Array,
     action: Array,
 ) -> jax.Array:
@@ -189,7 +190,7 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
     if not np.isfinite([low, high]).all():
         raise ValueError(f"{spec.id}: a Fourier basis needs finite bounds, got {low} and {high}")
     frequencies = np.pi * grids.product(*[np.arange(order + 1.0)] * len(low))
-    return functools.partial(_fourier, spec, inputs, low, high, frequencies)
+    return functools.partial(_fourier, spec, inputs, low, high, np.float32(frequencies))
 
 
 def _fourier(

@@ -29,7 +29,7 @@ def make(states: Grid, actions: Grid, hparams: IRLHParams | None = None) -> Rewa
 
 def _init(states: Grid, actions: Grid, hparams: IRLHParams, key: jax.Array) -> RewardState:
     del key
-    return state(jnp.zeros((states.size, actions.size)), hparams)
+    return state(jnp.zeros((states.size, actions.size), jnp.float32), hparams)
 
 
 def _reward(
