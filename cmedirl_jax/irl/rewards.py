@@ -149,7 +149,7 @@ def radial_basis(spec: EnvSpec, centres: int, inputs: Inputs = "state-action") -
     axis = np.linspace(-1.0, 1.0, centres)
     grid = grids.product(*[axis] * spec.observation_dim)
     width = np.float32(axis[1] - axis[0])
-    return functools.partial(_radial_basis, spec, inputs, scale, np.float32(grid), width)
+    return functools.partial(_radial_basis, spec, inputs, scale, grid.astype(np.float32), width)
 
 
 def _radial_basis(
@@ -190,7 +190,7 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
     if not np.isfinite([low, high]).all():
         raise ValueError(f"{spec.id}: a Fourier basis needs finite bounds, got {low} and {high}")
     frequencies = np.pi * grids.product(*[np.arange(order + 1.0)] * len(low))
-    return functools.partial(_fourier, spec, inputs, low, high, np.float32(frequencies))
+    return functools.partial(_fourier, spec, inputs, low, high, frequencies.astype(np.float32))
 
 
 def _fourier(
