@@ -250,10 +250,8 @@ def train_mode(network: Network) -> Callable[..., tuple[jax.Array, Params]]:
 def _dense(units: int, bound: float) -> nn.Dense:
     """A dense layer whose kernel and bias are drawn from U(-bound, bound)."""
 
-    def uniform(key: jax.Array, shape: tuple[int, ...], dtype=jnp.float32) -> jax.Array:
-        return jax.random.uniform(key, shape, dtype, -bound, bound)
-
-    return nn.Dense(units, kernel_init=uniform, bias_init=uniform)
+    initialise = functools.partial(jax.random.uniform, minval=-bound, maxval=bound)
+    return nn.Dense(units, kernel_init=initialise, bias_init=initialise)
 
 
 def _identity(observation: jax.Array) -> jax.Array:

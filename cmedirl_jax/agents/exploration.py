@@ -75,11 +75,11 @@ class EpsilonGreedyHParams(flax.struct.PyTreeNode):
             None: no noise, as in the paper.
     """
 
-    # None is part of the state's structure, so whether there is noise is static.
     epsilon_start: Share = 1.0
     epsilon_end: Share = 0.01
     epsilon_steps: AtLeastOne = 5000.0
     hold: AtLeastOne = 1.0
+    # None has no leaf, so that whether there is noise is static.
     noise: Positive | None = None
 
 
@@ -91,6 +91,9 @@ class ExplorationSettings:
         kind: Which exploration; the options of the others are ignored.
         hot_start_factor: Factor on the noise of a hot-started method: on sigma, on the scale, or on
             both epsilons.
+        ornstein_uhlenbeck: Noise that is correlated over time.
+        gaussian: Noise that is independent at each step.
+        epsilon_greedy: Random actions now and then.
     """
 
     kind: ExplorationName = "ornstein-uhlenbeck"

@@ -147,11 +147,9 @@ def greedy(mdp: FiniteMDP, action_values: Array) -> Callable[[jax.Array], jax.Ar
         action_values: Q `[S, A]` (or any other preference).
     """
     actions = jnp.asarray(interpolation.points(mdp.actions))
-
-    def act(observation: jax.Array) -> jax.Array:
-        return actions[jnp.argmax(look_up(mdp, action_values, observation), axis=-1)]
-
-    return act
+    return lambda observation: actions[
+        jnp.argmax(look_up(mdp, action_values, observation), axis=-1)
+    ]
 
 
 def sampled(mdp: FiniteMDP, env: Env) -> Env:
@@ -162,19 +160,21 @@ def sampled(mdp: FiniteMDP, env: Env) -> Env:
     is the number of the grid's actions. A log-probability may be -inf.
     """
     actions = jnp.asarray(interpolation.points(mdp.actions))
-
-    def step(key: jax.Array, state: Any, action: jax.Array, params: Any) -> tuple[Any, Step]:
-        draw_key, step_key = jax.random.split(key)
-        drawn = actions[jax.random.categorical(draw_key, action)]
-        return env.step(step_key, state, drawn, params)
-
     size = len(actions)
     spec = env.spec._replace(
         action_dim=size,
         action_low=np.full(size, np.finfo(np.float32).min),
         action_high=np.zeros(size, np.float32),
     )
-    return env._replace(spec=spec, step=step)
+    return env._replace(spec=spec, step=functools.partial(_step_drawn, env, actions))
+
+
+def _step_drawn(
+    env: Env, actions: jax.Array, key: jax.Array, state: Any, action: jax.Array, params: Any
+) -> tuple[Any, Step]:
+    draw_key, step_key = jax.random.split(key)
+    drawn = actions[jax.random.categorical(draw_key, action)]
+    return env.step(step_key, state, drawn, params)
 
 
 def grids(
