@@ -1,4 +1,4 @@
-"""Plots of what was measured."""
+"""Plots of the measurements."""
 
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ def _standard(record: dict[str, Any]) -> bool:
 
 
 def soak(samples: list[dict[str, Any]], path: Path) -> None:
-    """What a process held while it finished cell after cell."""
+    """Memory, files and threads of a process over time, and the cells it has finished."""
     minutes = [sample["seconds"] / 60 for sample in samples]
     panels = {
         "resident memory, MiB": [sample["resident_bytes"] / 2**20 for sample in samples],

@@ -16,7 +16,7 @@ from cmedirl_jax.runs.console import compile_cache
 
 
 def demonstrations(episodes: int) -> Demonstrations:
-    """Episodes of a scripted controller, which solves the task in about as many steps as DDPG."""
+    """Episodes of a scripted controller that solves the task, of about the length of DDPG's."""
     env = envs.make("MountainCarContinuous-v0")
 
     def act(actor: None, observation: jax.Array) -> jax.Array:
