@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import tyro
@@ -91,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def measure(options: Options, compiled: CompiledMethod) -> dict[str, object]:
+def measure(options: Options, compiled: CompiledMethod) -> dict[str, Any]:
     """Train the cell with and without checkpoints, in turn.
 
     Raises:
@@ -99,7 +100,7 @@ def measure(options: Options, compiled: CompiledMethod) -> dict[str, object]:
     """
     # The first training compiles.
     train_seconds(options, compiled, None)
-    ratios, checkpointers = [], []
+    ratios, checkpointers, sizes = [], [], []
     with tempfile.TemporaryDirectory() as folder:
         for number in range(options.rounds):
             checkpointer = _Timed(
@@ -117,8 +118,8 @@ def measure(options: Options, compiled: CompiledMethod) -> dict[str, object]:
                 )
             checkpointers.append(checkpointer)
             files = [path for path in checkpointer.folder.rglob("*") if path.is_file()]
-            size = sum(path.stat().st_size for path in files)
             kept = len(list(checkpointer.folder.iterdir()))
+            sizes.append(sum(path.stat().st_size for path in files) // kept)
     count = sum(checkpointer.saved for checkpointer in checkpointers)
     cost = statistics.median(ratios) - 1.0
     return {
@@ -127,7 +128,7 @@ def measure(options: Options, compiled: CompiledMethod) -> dict[str, object]:
         "every_seconds": options.every,
         "rounds": options.rounds,
         "checkpoints": count,
-        "checkpoint_bytes": size // kept,
+        "checkpoint_bytes": sizes[-1],
         "kept": checkpoints.KEPT,
         "blocked_seconds": sum(checkpointer.blocked for checkpointer in checkpointers) / count,
         "cost": cost,

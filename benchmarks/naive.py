@@ -7,7 +7,7 @@ field of the replay and a write position for every seed. It shares only its phys
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import flax.linen as nn
 import jax
@@ -64,7 +64,7 @@ class State(NamedTuple):
     reward: Any
     reward_optimizer: Any
     replay: dict[str, jax.Array]
-    count: jax.Array
+    taken: jax.Array
     env: Any
     observation: jax.Array
     noise: jax.Array
@@ -150,7 +150,7 @@ def init(parts: Parts, key: jax.Array) -> State:
             "next_observation": jnp.zeros((CAPACITY, 2)),
             "terminated": jnp.zeros(CAPACITY, bool),
         },
-        count=jnp.zeros((), jnp.int32),
+        taken=jnp.zeros((), jnp.int32),
         env=env_state,
         observation=first,
         noise=jnp.zeros(1),
@@ -169,7 +169,7 @@ def step(parts: Parts, state: State, number: jax.Array) -> tuple[State, jax.Arra
             state,
         )
     agent = jax.lax.cond(
-        state.count >= LEARNING_STARTS,
+        state.taken >= LEARNING_STARTS,
         lambda state: update_agent(parts, state, keys[5]),
         lambda state: state.agent,
         state,
@@ -190,7 +190,7 @@ def act(parts: Parts, state: State, keys: jax.Array) -> tuple[State, jax.Array]:
         "next_observation": result.observation,
         "terminated": result.terminated,
     }
-    position = state.count % CAPACITY
+    position = state.taken % CAPACITY
     replay = {name: field.at[position].set(row[name]) for name, field in state.replay.items()}
     done = result.terminated | result.truncated
     fresh_env, fresh_observation = parts.env.reset(keys[2], params)
@@ -201,7 +201,7 @@ def act(parts: Parts, state: State, keys: jax.Array) -> tuple[State, jax.Array]:
     )
     state = state._replace(
         replay=replay,
-        count=state.count + 1,
+        taken=state.taken + 1,
         env=env_state,
         observation=observation,
         noise=noise,
@@ -209,14 +209,19 @@ def act(parts: Parts, state: State, keys: jax.Array) -> tuple[State, jax.Array]:
     return state, result.reward
 
 
+def output(network: Network, params: Any, *inputs: jax.Array) -> jax.Array:
+    """The network's output, `[...]`."""
+    return cast(jax.Array, network.apply(params, *inputs))
+
+
 def policy(parts: Parts, actor: Any, observation: jax.Array) -> jax.Array:
     """mu(s), `[..., 1]`."""
-    return jnp.tanh(parts.actor.apply(actor, observation))[..., None]
+    return jnp.tanh(output(parts.actor, actor, observation))[..., None]
 
 
 def learned_reward(parts: Parts, reward: Any, observation: jax.Array, action: jax.Array):
     """r_D(s, a), `[...]`."""
-    return BOUND * jnp.tanh(parts.reward.apply(reward, observation, action))
+    return BOUND * jnp.tanh(output(parts.reward, reward, observation, action))
 
 
 def update_reward(parts: Parts, state: State, key: jax.Array) -> State:
@@ -225,14 +230,14 @@ def update_reward(parts: Parts, state: State, key: jax.Array) -> State:
     demonstration_key, background_key = jax.random.split(key)
     rows = jax.random.randint(demonstration_key, (batch,), 0, len(parts.demonstrated[0]))
     expert = jax.tree.map(lambda leaf: leaf[rows], parts.demonstrated)
-    index = jax.random.randint(background_key, (batch,), 0, state.count)
+    index = jax.random.randint(background_key, (batch,), 0, state.taken)
     background = state.replay["observation"][index], state.replay["action"][index]
 
     def loss(reward):
         everything = jax.tree.map(lambda *x: jnp.concatenate(x), expert, background)
-        output = parts.reward.apply(reward, *everything)
-        gap = jnp.mean(BOUND * jnp.tanh(output)) - jnp.mean(learned_reward(parts, reward, *expert))
-        return gap + OUTPUT_PENALTY * jnp.mean(output**2)
+        f = output(parts.reward, reward, *everything)
+        gap = jnp.mean(BOUND * jnp.tanh(f)) - jnp.mean(learned_reward(parts, reward, *expert))
+        return gap + OUTPUT_PENALTY * jnp.mean(f**2)
 
     gradient = jax.grad(loss)(state.reward)
     updates, optimizer = parts.reward_optimizer.update(gradient, state.reward_optimizer)
@@ -243,7 +248,7 @@ def update_reward(parts: Parts, state: State, key: jax.Array) -> State:
 
 def update_agent(parts: Parts, state: State, key: jax.Array) -> Agent:
     """A step of the critic, one of the actor, then both targets."""
-    index = jax.random.randint(key, (parts.workload.batch,), 0, state.count)
+    index = jax.random.randint(key, (parts.workload.batch,), 0, state.taken)
     batch = {name: field[index] for name, field in state.replay.items()}
     agent = update_critic(parts, state.agent, state.reward, batch)
     agent = update_actor(parts, agent, batch["observation"], key)
@@ -259,11 +264,11 @@ def update_critic(parts: Parts, agent: Agent, reward: Any, batch: dict[str, jax.
     if parts.method.learns_reward:
         rewards += learned_reward(parts, reward, batch["observation"], batch["action"])
     next_action = policy(parts, agent.target_actor, batch["next_observation"])
-    next_value = parts.critic.apply(agent.target_critic, batch["next_observation"], next_action)
+    next_value = output(parts.critic, agent.target_critic, batch["next_observation"], next_action)
     targets = rewards + DISCOUNT * (1.0 - batch["terminated"]) * next_value
 
     def loss(critic):
-        q = parts.critic.apply(critic, batch["observation"], batch["action"])
+        q = output(parts.critic, critic, batch["observation"], batch["action"])
         return jnp.mean((q - targets) ** 2)
 
     gradient = jax.grad(loss)(agent.critic)
@@ -276,9 +281,10 @@ def update_actor(parts: Parts, agent: Agent, observation: jax.Array, key: jax.Ar
     """A step along the critic's gradient, and towards the demonstrations after a hot start."""
 
     def loss(actor):
-        output = parts.actor.apply(actor, observation)
-        q = parts.critic.apply(agent.critic, observation, jnp.tanh(output)[..., None])
-        loss = -jnp.mean(q) + PENALTY * jnp.mean(output**2)
+        pre_activation = output(parts.actor, actor, observation)
+        action = jnp.tanh(pre_activation)[..., None]
+        q = output(parts.critic, agent.critic, observation, action)
+        loss = -jnp.mean(q) + PENALTY * jnp.mean(pre_activation**2)
         if parts.method.hot_start:
             seen, shown = parts.demonstrated
             rows = jax.random.randint(key, (parts.workload.batch,), 0, len(seen))

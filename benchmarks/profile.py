@@ -111,9 +111,9 @@ def main(options: Options) -> int:
     seconds = time.perf_counter() - began
 
     # Own time and number of events of each kind, over all threads.
-    kind_of = kinds(program.as_text())
-    spent: dict[str, float] = collections.Counter()
-    operations: dict[str, int] = collections.Counter()
+    kind_of = kinds(program.as_text() or "")
+    spent: dict[str, float] = collections.defaultdict(float)
+    operations: dict[str, int] = collections.defaultdict(int)
     for events in profiled(run):
         for name, duration in self_times(events):
             kind = kind_of.get(name, "control")

@@ -113,10 +113,13 @@ def start(job: dict[str, Any]) -> subprocess.Popen:
 def turn(workers: list[subprocess.Popen]) -> dict[str, float]:
     """Let an arrangement train a chunk; the times that its first process measured."""
     for worker in workers:
+        assert worker.stdin is not None
         worker.stdin.write("go\n")
         worker.stdin.flush()
     # The answer is JSON; the transport of the collectives prints lines of its own.
-    lines = [next(line for line in worker.stdout if line.startswith("{")) for worker in workers]
+    lines = [
+        next(line for line in worker.stdout or () if line.startswith("{")) for worker in workers
+    ]
     return json.loads(lines[0])
 
 
@@ -162,7 +165,7 @@ def work(
         times["flag_s"] = time.perf_counter() - before
         return state, times
 
-    done = 0
+    done, times = 0, {}
     for _ in sys.stdin:
         # The first turn compiles, and its first chunk learns nothing before step 200: the third
         # chunk is the first one that counts.
