@@ -1,4 +1,4 @@
-"""`python -m benchmarks.checkpoint_cost`: what checkpoints cost a run, with against without."""
+"""`python -m benchmarks.checkpoint_cost`: the share of a run's time that checkpoints take."""
 
 import dataclasses
 import statistics
@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import tyro
@@ -30,11 +31,10 @@ class Options:
     """What to measure, and where to write it.
 
     Attributes:
-        seeds: Learners of the cell, DDPG as `run_grid` trains it, on every core.
-        steps: Steps of each; the replay saved is the main job's, of 12,000.
-        every: Seconds between checkpoints: far more of them than a run makes, so that their cost
-            shows.
-        rounds: How often the cell is trained with and without, in turn.
+        seeds: Learners of the cell: DDPG as `run_grid` trains it, on every core.
+        steps: Environment steps of each. The replay has room for 12,000, as in the main job.
+        every: Seconds between checkpoints. A run saves far less often; here the cost is to show.
+        rounds: How often the cell is trained with and without checkpoints, in turn.
         json: File for the measurements.
     """
 
@@ -46,7 +46,12 @@ class Options:
 
 
 class _Timed(Checkpointer):
-    """Notes how long training stood still for each checkpoint."""
+    """A checkpointer that measures how long training stood still for it.
+
+    Attributes:
+        blocked: seconds in which training stood still.
+        saved: how many checkpoints were taken.
+    """
 
     blocked: float = 0.0
     saved: int = 0
@@ -61,7 +66,9 @@ class _Timed(Checkpointer):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; returns the exit code."""
-    options = tyro.cli(Options, prog="python -m benchmarks.checkpoint_cost", args=arguments)
+    options = tyro.cli(
+        Options, prog="python -m benchmarks.checkpoint_cost", description=__doc__, args=arguments
+    )
     compile_cache.use_cache()
     jax.config.update("jax_num_cpu_devices", max(1, measuring.cores()))
     compiled = ours.compile_programs("ddpg", Settings(), jax.devices(), seeds_count=options.seeds)
@@ -85,32 +92,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def measure(options: Options, compiled: CompiledMethod) -> dict[str, object]:
-    """Train the cell with and without, in turn.
+def measure(options: Options, compiled: CompiledMethod) -> dict[str, Any]:
+    """Train the cell with and without checkpoints, in turn.
 
     Raises:
         UserError: if it trains for less time than one checkpoint takes to fall due.
     """
-
-    def seconds(checkpointer: Checkpointer | None) -> float:
-        began = time.perf_counter()
-        cell_lib.train(
-            compiled,
-            jax.random.key(0),
-            None,
-            0,
-            seeds_count=options.seeds,
-            budget=Budget(options.steps, None, 250, 10),
-            threshold=0.0,
-            report=lambda progress: None,
-            checkpointer=checkpointer,
-        )
-        if checkpointer is not None:
-            checkpointer.wait()
-        return time.perf_counter() - began
-
-    seconds(None)
-    ratios, checkpointers = [], []
+    # The first training compiles.
+    train_seconds(options, compiled, None)
+    ratios, checkpointers, sizes = [], [], []
     with tempfile.TemporaryDirectory() as folder:
         for number in range(options.rounds):
             checkpointer = _Timed(
@@ -120,17 +110,16 @@ def measure(options: Options, compiled: CompiledMethod) -> dict[str, object]:
                 interruption=Interruption(),
                 say=lambda line: print(line, file=sys.stderr),
             )
-            without = seconds(None)
-            ratios.append(seconds(checkpointer) / without)
+            without = train_seconds(options, compiled, None)
+            ratios.append(train_seconds(options, compiled, checkpointer) / without)
             if not checkpointer.saved:
                 raise UserError(
                     f"--every: none was due in {without:.1f} s of training; ask for more --steps"
                 )
             checkpointers.append(checkpointer)
-            size = sum(
-                path.stat().st_size for path in checkpointer.folder.rglob("*") if path.is_file()
-            )
+            files = [path for path in checkpointer.folder.rglob("*") if path.is_file()]
             kept = len(list(checkpointer.folder.iterdir()))
+            sizes.append(sum(path.stat().st_size for path in files) // kept)
     count = sum(checkpointer.saved for checkpointer in checkpointers)
     cost = statistics.median(ratios) - 1.0
     return {
@@ -139,7 +128,7 @@ def measure(options: Options, compiled: CompiledMethod) -> dict[str, object]:
         "every_seconds": options.every,
         "rounds": options.rounds,
         "checkpoints": count,
-        "checkpoint_bytes": size // kept,
+        "checkpoint_bytes": sizes[-1],
         "kept": checkpoints.KEPT,
         "blocked_seconds": sum(checkpointer.blocked for checkpointer in checkpointers) / count,
         "cost": cost,
@@ -147,6 +136,27 @@ def measure(options: Options, compiled: CompiledMethod) -> dict[str, object]:
         "cost_high": max(ratios) - 1.0,
         "cost_by_default": cost * options.every / StudyConfig.checkpoint_every,
     }
+
+
+def train_seconds(
+    options: Options, compiled: CompiledMethod, checkpointer: Checkpointer | None
+) -> float:
+    """How long the cell trains, until its last checkpoint is written."""
+    began = time.perf_counter()
+    cell_lib.train(
+        compiled,
+        jax.random.key(0),
+        None,
+        0,
+        seeds_count=options.seeds,
+        budget=Budget(options.steps, None, 250, 10),
+        threshold=0.0,
+        report=lambda progress: None,
+        checkpointer=checkpointer,
+    )
+    if checkpointer is not None:
+        checkpointer.wait()
+    return time.perf_counter() - began
 
 
 if __name__ == "__main__":

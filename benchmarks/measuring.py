@@ -1,4 +1,4 @@
-"""Workloads timed in turn, each in a process of its own, and what is written about them."""
+"""Time workloads in turn, each in a process of its own, and write what was measured."""
 
 import dataclasses
 import datetime
@@ -26,7 +26,7 @@ class Record:
 
     Attributes:
         workload: what ran.
-        rates: learning steps per second, all seeds together, of each round.
+        rates: learning steps per second of each round, all seeds together.
         compile_seconds: spent on tracing and compiling until the end of the first call.
         peak_memory_bytes: of the process; None where the system does not account for it.
         platform: "cpu" or "gpu".
@@ -39,7 +39,7 @@ class Record:
     platform: str
 
     def fields(self) -> dict[str, Any]:
-        """As the JSON has it; seeds per second are those of a main job of `CAPACITY` steps."""
+        """The fields of the JSON; seeds per second are of `CAPACITY` steps, as in the main job."""
         median = statistics.median(self.rates)
         workload = dataclasses.asdict(self.workload)
         width = workload.pop("hidden")
@@ -59,7 +59,7 @@ class Record:
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """The ratio of two workloads' rates, round by round: what holds on a noisy machine."""
+    """The ratio of two workloads' rates, taken round by round, as a noisy machine requires."""
 
     suite: str
     name: str
@@ -69,7 +69,7 @@ class Comparison:
 
 
 def compare(suite: str, name: str, above: Sequence[float], below: Sequence[float]) -> Comparison:
-    """The ratio of two workloads' rates that were measured in turn."""
+    """The ratios of two workloads' rates that were measured in turn, `above` over `below`."""
     ratios = [x / y for x, y in zip(above, below, strict=True)]
     return Comparison(suite, name, statistics.median(ratios), min(ratios), max(ratios))
 
@@ -78,7 +78,7 @@ def in_turn(workers: Sequence[tuple[Worker, int, float]], rounds: int) -> list[l
     """Rates of each worker, `rounds` of them, measured A B C A B C ...
 
     Args:
-        workers: each with the steps to ask of it and the learning steps that those are.
+        workers: each with the steps of a call, and how many learning steps these are for all seeds.
         rounds: how often each is asked.
     """
     rates: list[list[float]] = [[] for _ in workers]
@@ -91,13 +91,13 @@ def in_turn(workers: Sequence[tuple[Worker, int, float]], rounds: int) -> list[l
 def measure(
     workloads: Sequence[Workload], rounds: int, *, compile_together: bool = False
 ) -> list[Record]:
-    """Time workloads in turn, those of one device on one core.
+    """Time workloads in turn; those of one device run on one core.
 
     Args:
         workloads: what to time.
         rounds: how often.
-        compile_together: let them all compile at once, which is sooner done but says nothing about
-            what one of them takes to compile.
+        compile_together: let them all compile at once. That is faster, but then
+            `compile_seconds` is not what one of them takes.
     """
     workers: list[Worker] = []
     try:
@@ -128,26 +128,26 @@ def measure(
 
 
 def start(workload: Workload, steps: int, **environment: str) -> Worker:
-    """The process of a workload, its first call of `steps` steps done."""
+    """Start the process of a workload, whose first call takes `steps` steps."""
     options = json.dumps({**dataclasses.asdict(workload), "steps": steps})
     command = [sys.executable, "-m", "benchmarks.worker", options]
     return Worker(command, one_core() if workload.devices == 1 else None, **environment)
 
 
 def steps_per_call(workload: Workload) -> int:
-    """Steps that take some seconds: as many as a chunk of a run, more for few or small learners."""
+    """Steps of a call of some seconds: more for few learners, fewer for large ones."""
     more = min(4, max(1, round(10_000 / (250 * workload.seeds))))
     less = max(1, (workload.hidden[0] // 64) * workload.batch // 32, workload.seeds // 400)
     return max(50, 250 * more // less)
 
 
 def one_core() -> list[int] | None:
-    """The last of the cores that this process may use; None where that cannot be said."""
+    """The last core that this process may use; None where the system does not tell."""
     return sorted(os.sched_getaffinity(0))[-1:] if hasattr(os, "sched_getaffinity") else None
 
 
 def heading(program: str) -> dict[str, Any]:
-    """What every file of measurements begins with."""
+    """The first fields of every file of measurements."""
     return {
         "command": f"python -m benchmarks.{program} " + " ".join(sys.argv[1:]),
         "date": datetime.date.today().isoformat(),
@@ -157,13 +157,13 @@ def heading(program: str) -> dict[str, Any]:
 
 
 def write(result: dict[str, Any], path: Path) -> None:
-    """Write a file of measurements, and the folder that it lies in."""
+    """Write a file of measurements; makes its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(result, indent=1) + "\n")
 
 
 def machine() -> dict[str, Any]:
-    """What the numbers were measured on."""
+    """The machine that the numbers were measured on."""
     model = platform.processor()
     information = Path("/proc/cpuinfo")
     if information.exists():
@@ -179,5 +179,5 @@ def machine() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of the packages that the numbers depend on."""
+    """Versions of the packages that the numbers depend on."""
     return {name: importlib.metadata.version(name) for name in PACKAGES}

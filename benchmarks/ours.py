@@ -31,13 +31,14 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
             hidden=workload.hidden,
             critic_normalisation="layer" if workload.layer_norm else "none",
         ),
-        # Never frozen, so that its cost is the same however long the benchmark runs.
         reward_network=RewardNetworkSettings(hidden=workload.hidden),
         reward_batches=RewardBatchSettings(batch_size=workload.batch),
+        # Never frozen, so that its cost is the same however long the benchmark runs.
         reward_schedule=RewardSchedule(stop=None),
-        # The hot start is over before anything is timed; it need not be a good one.
+        # The hot start is over before anything is timed, so a poor one will do.
         hot_start=HotStartHParams(steps=20),
-        # At once, for a call that only collected would look fast; the cloning never fades either.
+        # Learning starts at step 0, because steps without updates would look fast. The cloning
+        # never fades, so that its cost stays the same.
         schedule=Schedule(
             batch_size=workload.batch, learning_starts=0, behaviour_cloning_steps=10**9
         ),
@@ -50,6 +51,8 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         group=workload.group,
         subset_size=workload.n_demos,
     )
+
+    # Seeds that have ended are spread at random, then moved behind those that run.
     data = hot_start.data(pool) if METHODS[workload.method].uses_demonstrations else None
     slots = Slots(programs.slots, workload.seeds, programs.group, programs.devices)
     state = compiled_lib.begin(programs, slots, jax.random.key(0), data, workload.n_demos)
@@ -77,7 +80,16 @@ def compile_programs(
     group: int | None = None,
     subset_size: int | None = None,
 ) -> CompiledMethod:
-    """One method's programs, with the main job's replay; `group` None for the library's choice."""
+    """One method's programs, with the main job's replay.
+
+    Args:
+        method: its name.
+        settings: its settings.
+        devices: that share the seeds.
+        seeds_count: how many seeds.
+        group: seeds that a device steps together; None: the library's choice.
+        subset_size: demonstrations of each seed; None without any.
+    """
     env, architecture = envs.make("MountainCarContinuous-v0"), settings.architecture
     group = group or seeds.group_size(seeds_count, len(devices), architecture.hidden)
     return compiled_lib.compile_method(

@@ -1,8 +1,8 @@
 """`python -m benchmarks.peers`: our rate beside that of other libraries, on one core.
 
-Each peer gets an environment of its own, made at its first use and kept in the user's cache folder.
-All loops use the same networks, batch and replay and take one update per environment step; they are
-timed in turn. What is not the same work is printed with the numbers.
+Each peer has a virtual environment of its own, which is made at its first use and kept in the
+user's cache folder. All loops have the same sizes of networks, batch and replay and take one update
+per environment step. They are timed in turn. Differences in the work are printed with the numbers.
 """
 
 import contextlib
@@ -34,11 +34,11 @@ class Peer(NamedTuple):
     """Another library's training loop.
 
     Attributes:
-        name: as the table has it.
+        name: in the table.
         module: of `benchmarks.peer_loops`.
         requirements: what pip installs into its environment.
         seeds: learners that it trains at once.
-        difference: what is not the same work.
+        difference: how its work differs from ours.
     """
 
     name: str
@@ -85,9 +85,9 @@ class Options:
     """Whom to compare with, and where to write it.
 
     Attributes:
-        peers: Which peers.
+        peers: Peers to measure, by their modules in `benchmarks.peer_loops`.
         rounds: How often each is timed.
-        environments: Folder of the peers' environments.
+        environments: Folder of the peers' virtual environments.
         json: File for the measurements.
     """
 
@@ -98,10 +98,10 @@ class Options:
 
 
 def environment(name: str, requirements: Sequence[str], folder: Path) -> Path:
-    """The Python of the environment `name` below `folder`, made if it does not hold all of it.
+    """The Python of the virtual environment `folder / name`, made anew for other requirements.
 
     Raises:
-        RuntimeError: if something cannot be installed, with the end of what the installer said.
+        RuntimeError: if something cannot be installed, with the end of the installer's message.
     """
     root = folder / name
     python = root / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
@@ -123,7 +123,7 @@ def environment(name: str, requirements: Sequence[str], folder: Path) -> Path:
 
 
 def versions(python: Path) -> dict[str, str]:
-    """What is installed beside a peer."""
+    """The versions of the packages in a peer's environment."""
     listed = subprocess.run(
         [python, "-m", "pip", "list", "--format", "json"],
         capture_output=True,
@@ -134,37 +134,18 @@ def versions(python: Path) -> dict[str, str]:
 
 
 def main(options: Options) -> int:
-    """Install, measure, print and write."""
+    """Install, measure, print and write; returns the exit code."""
     console = Console(width=None if sys.stdout.isatty() else 140)
     ours = Workload()
     entries: list[dict[str, Any]] = [
         peer._asdict() for peer in PEERS if peer.module in options.peers
     ]
-    with contextlib.ExitStack() as running:
-        our_worker = measuring.start(ours, STEPS)
-        running.callback(our_worker.stop)
-        workers = [(our_worker, STEPS, float(ours.seeds * STEPS))]
-        for entry in entries:
-            console.print(f"{entry['name']}: preparing")
-            try:
-                python = environment(entry["module"], entry["requirements"], options.environments)
-                command = [str(python), "-m", f"benchmarks.peer_loops.{entry['module']}"]
-                sizes = [str(entry["seeds"]), str(STEPS)]
-                worker = Worker([*command, *sizes], measuring.one_core())
-                running.callback(worker.stop)
-                worker.wait()
-            except (RuntimeError, OSError, subprocess.CalledProcessError) as error:
-                entry["error"] = str(error)
-                continue
-            entry["versions"] = versions(python)
-            workers.append((worker, STEPS, float(entry["seeds"] * STEPS)))
-        # Some compile again at their second call.
-        measuring.in_turn(workers, 1)
-        our_rates, *rates = measuring.in_turn(workers, options.rounds)
-    measured = (entry for entry in entries if "error" not in entry)
-    for entry, peer_rates in zip(measured, rates, strict=True):
-        ratio = measuring.compare("peers", f"ours / {entry['name']}", our_rates, peer_rates)
-        entry["learning_steps_per_second"] = statistics.median(peer_rates)
+    our_rates, peer_rates = measure(ours, entries, options, console)
+    for entry, rates in zip(entries, peer_rates, strict=True):
+        if rates is None:
+            continue
+        ratio = measuring.compare("peers", f"ours / {entry['name']}", our_rates, rates)
+        entry["learning_steps_per_second"] = statistics.median(rates)
         entry["ratio"] = dataclasses.asdict(ratio)
     result = {
         **measuring.heading("peers"),
@@ -177,8 +158,54 @@ def main(options: Options) -> int:
     return 0
 
 
+def measure(
+    ours: Workload, entries: list[dict[str, Any]], options: Options, console: Console
+) -> tuple[list[float], list[list[float] | None]]:
+    """Time our loop and each peer's in turn.
+
+    Returns:
+        Our rates, and each entry's; None for one that could not be started. Such an entry gets the
+        field "error", the others "versions".
+    """
+    with contextlib.ExitStack() as running:
+        our_worker = measuring.start(ours, STEPS)
+        running.callback(our_worker.stop)
+        timed = [(our_worker, STEPS, float(ours.seeds * STEPS))]
+        for entry in entries:
+            console.print(f"{entry['name']}: preparing")
+            try:
+                worker = start(entry, options.environments, running)
+            except (RuntimeError, OSError, subprocess.CalledProcessError) as error:
+                entry["error"] = str(error)
+                continue
+            timed.append((worker, STEPS, float(entry["seeds"] * STEPS)))
+        # Some loops compile again at their second call, which is therefore not counted.
+        measuring.in_turn(timed, 1)
+        our_rates, *rates = measuring.in_turn(timed, options.rounds)
+    remaining = iter(rates)
+    return our_rates, [None if "error" in entry else next(remaining) for entry in entries]
+
+
+def start(entry: dict[str, Any], environments: Path, running: contextlib.ExitStack) -> Worker:
+    """The process of a peer's loop, its first call done; `running` stops it at the end.
+
+    Raises:
+        RuntimeError: if it cannot be installed, or its loop fails.
+        OSError: if its environment cannot be made.
+        subprocess.CalledProcessError: likewise.
+    """
+    python = environment(entry["module"], entry["requirements"], environments)
+    command = [str(python), "-m", f"benchmarks.peer_loops.{entry['module']}"]
+    sizes = [str(entry["seeds"]), str(STEPS)]
+    worker = Worker([*command, *sizes], measuring.one_core())
+    running.callback(worker.stop)
+    worker.wait()
+    entry["versions"] = versions(python)
+    return worker
+
+
 def table(result: dict[str, Any]) -> Table:
-    """The rates, and what is not the same work."""
+    """The rates, and how the work differs."""
     shown = Table(box=box.SIMPLE, title="learning steps per second on one core, medians")
     shown.add_column("loop")
     for name in ("seeds", "steps/s", "ours is faster"):
@@ -202,4 +229,5 @@ def table(result: dict[str, Any]) -> Table:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, prog="python -m benchmarks.peers")))
+    options = tyro.cli(Options, prog="python -m benchmarks.peers", description=__doc__)
+    sys.exit(main(options))

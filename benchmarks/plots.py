@@ -1,12 +1,14 @@
-"""Plots of what was measured."""
+"""Plots of the measurements."""
 
 from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 
 matplotlib.use("agg")
 from matplotlib import pyplot as plt
+from matplotlib import ticker
 
 
 def growth(records: list[dict[str, Any]], path: Path) -> None:
@@ -19,7 +21,7 @@ def growth(records: list[dict[str, Any]], path: Path) -> None:
         ),
         "batch": ("batch", lambda record: record["batch"]),
     }
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), constrained_layout=True)
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), sharey=True, constrained_layout=True)
     for axis, (suite, (label, position)) in zip(axes, panels.items(), strict=True):
         for variant, style in (("ours", "o-"), ("naive", "s--")):
             chosen = [
@@ -33,9 +35,15 @@ def growth(records: list[dict[str, Any]], path: Path) -> None:
             points = sorted((position(r), r["seeds"] / r["seeds_per_second"]) for r in chosen)
             if points:
                 axis.plot(*zip(*points, strict=True), style, label=variant)
-        axis.set(xscale="log", yscale="log", xlabel=label, ylabel="seconds for 12,000 steps")
+        axis.set(xscale="log", yscale="log", xlabel=label)
+        # Whole numbers, at the measured points: powers of ten read badly over so short an axis.
+        measured = sorted({int(x) for line in axis.lines for x in np.asarray(line.get_xdata())})
+        axis.set_xticks(measured, [f"{x:,}" for x in measured])
+        axis.xaxis.set_minor_locator(ticker.NullLocator())
         if axis.lines:
             axis.legend()
+    axes[0].set_ylabel("seconds for 12,000 steps")
+    axes[0].yaxis.set_major_formatter(ticker.StrMethodFormatter("{x:,g}"))
     figure.suptitle("DDPG on one core; 100 seeds, (64, 64), batch 32 where not said otherwise")
     figure.savefig(path, dpi=150)
     plt.close(figure)
@@ -46,7 +54,7 @@ def _standard(record: dict[str, Any]) -> bool:
 
 
 def soak(samples: list[dict[str, Any]], path: Path) -> None:
-    """What a process held while it finished cell after cell."""
+    """Memory, files and threads of a process over time, and the cells it has finished."""
     minutes = [sample["seconds"] / 60 for sample in samples]
     panels = {
         "resident memory, MiB": [sample["resident_bytes"] / 2**20 for sample in samples],

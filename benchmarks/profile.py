@@ -1,19 +1,22 @@
 """`python -m benchmarks.profile`: where the time of DDPG's learning step goes, by operation.
 
-One group of seeds runs a chunk under XLA's own profiler. An operation counts with the time that
-passes within it and not within another one; operations of a chunk's start count as well.
+One group of seeds runs a chunk under XLA's profiler. An operation counts with its own time, without
+that of the operations inside it. The operations at a chunk's start count too.
 """
 
 import collections
 import dataclasses
+import functools
 import re
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 import tyro
 from rich import box
 from rich.console import Console
@@ -27,6 +30,8 @@ from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.settings import Settings
 
 STEPS = 250
+"""Environment steps of the chunk."""
+_NUMBERS = np.arange(STEPS, 2 * STEPS, dtype=np.int32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +39,7 @@ class Options:
     """What to profile.
 
     Attributes:
-        group: Seeds of the group.
+        group: Seeds in the group.
         hidden: Units of each hidden layer.
         layer_norm: Layer normalisation in the critic.
     """
@@ -47,18 +52,18 @@ class Options:
 def kinds(program: str) -> dict[str, str]:
     """The kind of each operation in a compiled program's text, by the operation's name."""
     bodies = dict(re.findall(r"^%?([\w.\-]+) \([^\n]*\{\n(.*?)^\}", program, re.M | re.S))
-    found = {}
+    kind_of = {}
     for name, operation, rest in re.findall(
         r"%?([\w.\-]+) = (?:\([^=]*?\)|\S+) ([\w\-]+)\((.*)", program
     ):
         called = re.search(r"calls=%?([\w.\-]+)", rest)
         source = re.search(r'op_name="([^"]*)"', rest)
-        found[name] = _kind(
+        kind_of[name] = _kind(
             operation,
             bodies.get(called.group(1), "") if called else "",
             source.group(1) if source else "",
         )
-    return found
+    return kind_of
 
 
 def _kind(operation: str, body: str, source: str) -> str:
@@ -76,7 +81,7 @@ def _kind(operation: str, body: str, source: str) -> str:
 
 
 def self_times(events: list[tuple[str, float, float]]) -> list[tuple[str, float]]:
-    """Each `(name, start, duration)` of one thread with its duration less that of those within."""
+    """Each event of one thread, `(name, start, duration)`, with its time outside inner events."""
     result: list[tuple[str, float]] = []
     open_events: list[tuple[str, float, float]] = []  # name, end, own time so far
 
@@ -97,7 +102,30 @@ def self_times(events: list[tuple[str, float, float]]) -> list[tuple[str, float]
 
 
 def main(options: Options) -> int:
-    """Run a chunk under the profiler and print its table."""
+    """Run a chunk under the profiler and print its table; returns the exit code."""
+    program, state = compiled_chunk(options)
+    run = functools.partial(_run, program, state)
+    run()
+    began = time.perf_counter()
+    run()
+    seconds = time.perf_counter() - began
+
+    # Own time and number of events of each kind, over all threads.
+    kind_of = kinds(program.as_text() or "")
+    spent: dict[str, float] = collections.defaultdict(float)
+    operations: dict[str, int] = collections.defaultdict(int)
+    for events in profiled(run):
+        for name, duration in self_times(events):
+            kind = kind_of.get(name, "control")
+            spent[kind] += duration
+            operations[kind] += 1
+
+    Console().print(table(options, seconds, spent, operations))
+    return 0
+
+
+def compiled_chunk(options: Options) -> tuple[jax.stages.Compiled, Any]:
+    """The compiled program of a group's chunk, and the state it starts from."""
     env = envs.make("MountainCarContinuous-v0")
     normalisation = "layer" if options.layer_norm else "none"
     architecture = Architecture(hidden=options.hidden, critic_normalisation=normalisation)
@@ -105,23 +133,22 @@ def main(options: Options) -> int:
     trainer = training.make(env, METHODS["ddpg"], settings, capacity=CAPACITY)
     keys = seeds.keys(jax.random.key(0), options.group)
     state = jax.jit(jax.vmap(lambda key: trainer.init(key, None, 0)))(keys)
-    numbers = jnp.arange(STEPS, 2 * STEPS)
-    program = (
-        jax.jit(seeds.step_groups(trainer.run, options.group))
-        .lower(state, 1, None, numbers)
-        .compile()
-    )
-    run = lambda: jax.block_until_ready(program(state, 1, None, numbers))  # noqa: E731
-    run()
-    began = time.perf_counter()
-    run()
-    seconds = time.perf_counter() - began
+    step_groups = jax.jit(seeds.step_groups(trainer.run, options.group))
+    return step_groups.lower(state, 1, None, _NUMBERS).compile(), state
+
+
+def _run(program: jax.stages.Compiled, state: Any) -> None:
+    jax.block_until_ready(program(state, 1, None, _NUMBERS))
+
+
+def profiled(run: Callable[[], None]) -> list[list[tuple[str, float, float]]]:
+    """The operations of `run`, `(name, start, duration)` in nanoseconds, of each thread."""
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
             run()
         (trace,) = Path(folder).rglob("*.xplane.pb")
         planes = jax.profiler.ProfileData.from_file(str(trace)).planes
-        threads = [
+        return [
             [
                 (event.name, event.start_ns, event.duration_ns)
                 for event in line.events
@@ -130,29 +157,27 @@ def main(options: Options) -> int:
             for plane in planes
             for line in plane.lines
         ]
-    kind_of = kinds(program.as_text())
-    spent: dict[str, float] = collections.Counter()
-    operations: dict[str, int] = collections.Counter()
-    for thread in threads:
-        for name, duration in self_times(thread):
-            kind = kind_of.get(name, "control")
-            spent[kind] += duration
-            operations[kind] += 1
-    whole = sum(spent.values())
-    table = Table(box=box.SIMPLE, title=f"{options.group} seeds, width {options.hidden}")
-    table.add_column("operations")
+
+
+def table(
+    options: Options, seconds: float, spent: dict[str, float], operations: dict[str, int]
+) -> Table:
+    """Shares of the time by kind of operation, and microseconds of the unprofiled run."""
+    shown = Table(box=box.SIMPLE, title=f"{options.group} seeds, width {options.hidden}")
+    shown.add_column("operations")
     for name in ("share", "us per learning step", "operations per step of the group"):
-        table.add_column(name, justify="right")
+        shown.add_column(name, justify="right")
     per_step = seconds / (STEPS * options.group) * 1e6
+    whole = sum(spent.values())
     for kind, duration in sorted(spent.items(), key=lambda item: -item[1]):
         share = duration / whole
-        table.add_row(
+        shown.add_row(
             kind, f"{share:.0%}", f"{share * per_step:.1f}", f"{operations[kind] / STEPS:.0f}"
         )
-    table.add_row("all, without the profiler", "", f"{per_step:.1f}", "")
-    Console().print(table)
-    return 0
+    shown.add_row("all, without the profiler", "", f"{per_step:.1f}", "")
+    return shown
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, prog="python -m benchmarks.profile")))
+    options = tyro.cli(Options, prog="python -m benchmarks.profile", description=__doc__)
+    sys.exit(main(options))

@@ -1,8 +1,8 @@
 """`python -m benchmarks.scaling`: the same seeds on one process and on two, chunk by chunk.
 
-Three groups of processes take turns: one process with two devices, two processes with one device
-each over loopback, and one process with one device and half of the seeds, which is the share of one
-device. What the processes tell each other after every chunk is timed apart.
+Three arrangements take turns: one process with two devices, two processes with one device each over
+loopback, and one process with one device and half of the seeds, which is one device's share. The
+communication after every chunk is timed by itself.
 """
 
 import dataclasses
@@ -30,11 +30,13 @@ from cmedirl_jax.training import seeds
 from cmedirl_jax.training.settings import Settings
 
 GROUPS = {"1 process x 2 devices": (1, 2), "2 processes x 1 device": (2, 1), "its share": (1, 1)}
-"""Processes, and devices of each."""
-WORKER = "--worker"
+"""Of each arrangement: how many processes, and how many devices each of them has."""
 PAIR = list(GROUPS)[:2]
+"""The two arrangements with all seeds, which are compared."""
+WORKER = "--worker"
+"""The first argument of a process that is measured."""
 EXTRA_FLOATS = (2**12, 2**14, 2**16)
-"""Sizes of further arrays that are gathered, per seed, to tell latency from bandwidth."""
+"""Floats per seed of further arrays that are gathered, to tell latency from bandwidth."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +44,9 @@ class Options:
     """What to measure, and where to write it.
 
     Attributes:
-        method: A method without demonstrations.
-        seeds: Seeds that the groups share.
-        rounds: Turns of each group.
+        method: A method that uses no demonstrations.
+        seeds: Seeds that an arrangement trains (the last one half of them).
+        rounds: Turns of each arrangement.
         json: File for the measurements.
     """
 
@@ -60,13 +62,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments[:1] == [WORKER]:
         work(**json.loads(arguments[1]))
         return 0
-    options = tyro.cli(Options, prog="python -m benchmarks.scaling", args=arguments)
-    found = measure(options.method, options.seeds, options.rounds)
-    one, two = ([turn["chunk_s"] + turn["gather_s"] for turn in found[name]] for name in PAIR)
+    options = tyro.cli(
+        Options, prog="python -m benchmarks.scaling", description=__doc__, args=arguments
+    )
+    measured = measure(options.method, options.seeds, options.rounds)
+    one, two = ([turn["chunk_s"] + turn["gather_s"] for turn in measured[name]] for name in PAIR)
     ratios = sorted(a / b for a, b in zip(one, two, strict=True))
     median = statistics.median(ratios)
     print(f"Two processes have {median:.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f}) times the rate")
-    for name, turns in found.items():
+    for name, turns in measured.items():
         seconds = {key: f"{value:.4g}" for key, value in medians(turns).items()}
         print(f"{name}: {seconds}")
     if options.json is not None:
@@ -74,15 +78,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "method": options.method,
             "seeds": options.seeds,
             "two_processes_rate_over_one": [median, ratios[0], ratios[-1]],
-            "medians": {name: medians(turns) for name, turns in found.items()},
-            "rounds": found,
+            "medians": {name: medians(turns) for name, turns in measured.items()},
+            "rounds": measured,
         }
         measuring.write(result, options.json)
     return 0
 
 
 def measure(method: str, seeds_count: int, rounds: int) -> dict[str, list[dict[str, float]]]:
-    """Let the groups take turns; each one's times, in seconds, round for round."""
+    """Let the arrangements take turns; each one's times, in seconds, round by round."""
     started = {}
     for name, (processes, devices) in GROUPS.items():
         with socket.socket() as listener:
@@ -93,31 +97,34 @@ def measure(method: str, seeds_count: int, rounds: int) -> dict[str, list[dict[s
         job |= {"coordinator": f"127.0.0.1:{port}", "processes": processes}
         started[name] = [start(job | {"index": index}) for index in range(processes)]
     try:
-        found = [{name: turn(workers) for name, workers in started.items()} for _ in range(rounds)]
+        times = [{name: turn(workers) for name, workers in started.items()} for _ in range(rounds)]
     finally:
         for worker in (worker for workers in started.values() for worker in workers):
             worker.kill()
-    return {name: [turns[name] for turns in found] for name in started}
+    return {name: [turns[name] for turns in times] for name in started}
 
 
 def start(job: dict[str, Any]) -> subprocess.Popen:
-    """A process that is measured."""
+    """Start a process that is measured."""
     command = [sys.executable, "-m", "benchmarks.scaling", WORKER, json.dumps(job)]
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 def turn(workers: list[subprocess.Popen]) -> dict[str, float]:
-    """One chunk of a group; the times that its first process measured."""
+    """Let an arrangement train a chunk; the times that its first process measured."""
     for worker in workers:
+        assert worker.stdin is not None
         worker.stdin.write("go\n")
         worker.stdin.flush()
-    # The transport of the collectives prints too.
-    lines = [next(line for line in worker.stdout if line.startswith("{")) for worker in workers]
+    # The answer is JSON; the transport of the collectives prints lines of its own.
+    lines = [
+        next(line for line in worker.stdout or () if line.startswith("{")) for worker in workers
+    ]
     return json.loads(lines[0])
 
 
 def medians(turns: list[dict[str, float]]) -> dict[str, float]:
-    """Of every quantity."""
+    """The median over the turns of every quantity."""
     return {name: statistics.median(turn[name] for turn in turns) for name in turns[0]}
 
 
@@ -130,6 +137,8 @@ def work(
         jax.distributed.initialize(coordinator, processes, index)
     spread_over = exchange.devices(devices, seeds_count)
     exchange.connect(spread_over)
+
+    # The seeds as a run of many seeds has them.
     programs = ours.compile_programs(method, Settings(), spread_over, seeds_count=seeds_count)
     slots = Slots(programs.slots, seeds_count, programs.group, programs.devices)
     state = compiled_lib.begin(programs, slots, jax.random.key(0), None, 0)
@@ -139,29 +148,35 @@ def work(
         jax.jit(lambda n=n: jnp.zeros((programs.slots, n)), out_shardings=split)()
         for n in (EXTRA_FLOATS if processes > 1 else ())
     ]
-    begun, warm = 0, False
+
+    def chunk(state: Any, number: int) -> tuple[Any, dict[str, float]]:
+        times: dict[str, float] = {}
+        first = number * cell_lib.CHUNK
+        steps = jnp.arange(first, first + cell_lib.CHUNK, dtype=jnp.int32)
+        before = time.perf_counter()
+        state, log = jax.block_until_ready(programs.run(state, groups, None, steps, None))
+        times["chunk_s"] = time.perf_counter() - before
+        timed(times, "gather", log)
+        times["gather_bytes"] = sum(leaf.nbytes for leaf in jax.tree.leaves(log))
+        for array in extra:
+            timed(times, f"gather_{array.nbytes}_bytes", array)
+        before = time.perf_counter()
+        exchange.any_process(False)
+        times["flag_s"] = time.perf_counter() - before
+        return state, times
+
+    done, times = 0, {}
     for _ in sys.stdin:
-        # The first turn compiles, and its first chunk learns nothing before step 200.
-        for last in (True,) if warm else (False, False, True):
-            times = {}
-            steps = jnp.arange(begun, begun + cell_lib.CHUNK, dtype=jnp.int32)
-            before = time.perf_counter()
-            state, log = jax.block_until_ready(programs.run(state, groups, None, steps, None))
-            times["chunk_s"] = time.perf_counter() - before
-            timed(times, "gather", log)
-            times["gather_bytes"] = sum(leaf.nbytes for leaf in jax.tree.leaves(log))
-            for array in extra:
-                timed(times, f"gather_{array.nbytes}_bytes", array)
-            before = time.perf_counter()
-            exchange.any_process(False)
-            times["flag_s"] = time.perf_counter() - before
-            begun += cell_lib.CHUNK
-            warm = last
+        # The first turn compiles, and its first chunk learns nothing before step 200: the third
+        # chunk is the first one that counts.
+        for _ in range(1 if done else 3):
+            state, times = chunk(state, done)
+            done += 1
         print(json.dumps(times), flush=True)
 
 
 def timed(times: dict[str, float], name: str, tree: Any) -> None:
-    """Gather a tree; note the seconds."""
+    """Gather a tree, and note the seconds as `times[name + "_s"]`."""
     before = time.perf_counter()
     exchange.gather(tree)
     times[f"{name}_s"] = time.perf_counter() - before

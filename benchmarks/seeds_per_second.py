@@ -1,7 +1,7 @@
 """`python -m benchmarks.seeds_per_second`: how many seeds a second, against a plain reference.
 
-Every number comes from workloads that are timed in turn, so that the ratios hold on a machine whose
-speed drifts. A workload of one device runs on one core.
+Workloads are timed in turn, so that their ratios hold on a machine whose speed drifts. A workload
+of one device runs on one core.
 """
 
 import dataclasses
@@ -31,10 +31,10 @@ class Options:
     """What to measure, and where to write it.
 
     Attributes:
-        quick: DDPG at 100 seeds alone, on one device and on all: within a minute.
-        suites: Only these parts of the whole: seeds, width, batch, method, scale, devices, ended,
-            demonstrations, group, compilation.
-        methods: Only these methods.
+        quick: DDPG at 100 seeds alone, on one device and on all: about a minute.
+        suites: Parts to measure: seeds, width, batch, method, scale, devices, ended,
+            demonstrations, group, compilation; default: all.
+        methods: Methods to measure.
         devices: Devices of the workloads that use several; default: every core, or every GPU.
         rounds: How often each workload is timed; default 5, with --quick 3.
         json: File for the measurements; a plot is drawn beside it.
@@ -49,7 +49,13 @@ class Options:
 
 
 class Suite(NamedTuple):
-    """Workloads that are timed in turn; `ratios` names pairs of them by position."""
+    """Workloads that are timed in turn.
+
+    Attributes:
+        name: of the suite.
+        workloads: what is timed.
+        ratios: name, and positions of the workloads whose rates are divided.
+    """
 
     name: str
     workloads: list[Workload]
@@ -57,45 +63,35 @@ class Suite(NamedTuple):
 
 
 def suites(devices: int, methods: Sequence[str], quick: bool) -> Iterator[Suite]:
-    """All there is to measure, in parts."""
-    ours, naive = Workload(), Workload("naive")
-    everywhere = dataclasses.replace(ours, devices=devices)
+    """Everything there is to measure, in parts.
+
+    Args:
+        devices: of the workloads that use several.
+        methods: names of methods.
+        quick: DDPG at 100 seeds alone.
+    """
     if quick:
-        workloads = [ours, naive] + [everywhere] * (devices > 1)
-        ratios = [("ours / naive", 0, 1), (f"{devices} devices / 1", 2, 0)]
-        yield Suite("quick", workloads, ratios[: len(workloads) - 1])
+        yield _quick(devices)
         return
+    # Ours against the naive reference.
     for method, seeds in itertools.product(methods, SEEDS):
-        pair = [Workload(variant, method, seeds) for variant in ("ours", "naive")]
-        yield Suite("seeds", pair, [(f"ours / naive, {method}, {seeds} seeds", 0, 1)])
+        yield _against_naive("seeds", f"{method}, {seeds} seeds", method=method, seeds=seeds)
     for hidden, layer_norm in itertools.product(WIDTHS, (False, True)):
-        pair = [
-            Workload(variant, hidden=hidden, layer_norm=layer_norm) for variant in ("ours", "naive")
-        ]
-        name = f"ours / naive, width {hidden}{', layer norm' * layer_norm}"
-        yield Suite("width", pair, [(name, 0, 1)])
-    pair = [Workload(variant, batch=128) for variant in ("ours", "naive")]
-    yield Suite("batch", pair, [("ours / naive, batch 128", 0, 1)])
-    beside = [method for method in methods if method != "ddpg"]
-    yield Suite(
-        "method",
-        [ours, *(Workload(method=name) for name in beside), Workload(layer_norm=True)],
-        [
-            *((f"cost of {name} / ddpg", 0, i) for i, name in enumerate(beside, start=1)),
-            ("cost of layer norm / none", 0, len(beside) + 1),
-        ],
-    )
+        name = f"width {hidden}{', layer norm' * layer_norm}"
+        yield _against_naive("width", name, hidden=hidden, layer_norm=layer_norm)
+    yield _against_naive("batch", "batch 128", batch=128)
+
+    # Ours against ours: what costs what.
+    ours = Workload()
+    yield _methods(methods)
     yield Suite("scale", [ours, Workload(seeds=1000)], [("1,000 seeds / 100 seeds", 1, 0)])
     if devices > 1:
         for method in methods:
             one = Workload(method=method)
             pair = [dataclasses.replace(one, devices=devices), one]
             yield Suite("devices", pair, [(f"{devices} devices / 1, {method}", 0, 1)])
-    yield Suite(
-        "ended",
-        [Workload(running=0.2), ours],
-        [("rate with 20% of the seeds running / all", 0, 1)],
-    )
+    ratio = ("rate with 20% of the seeds running / all", 0, 1)
+    yield Suite("ended", [Workload(running=0.2), ours], [ratio])
     demonstrated = [Workload(method="me-ddpg", n_demos=count) for count in (1, 10, 100, 1000)]
     names = [f"cost with {workload.n_demos} demonstrations / 1" for workload in demonstrated]
     yield Suite("demonstrations", demonstrated, [(names[i], 0, i) for i in range(1, 4)])
@@ -106,37 +102,50 @@ def suites(devices: int, methods: Sequence[str], quick: bool) -> Iterator[Suite]
         yield Suite("group", groups, ratios[1:])
 
 
+def _quick(devices: int) -> Suite:
+    ours = Workload()
+    everywhere = dataclasses.replace(ours, devices=devices)
+    workloads = [ours, Workload("naive")] + [everywhere] * (devices > 1)
+    ratios = [("ours / naive", 0, 1), (f"{devices} devices / 1", 2, 0)]
+    return Suite("quick", workloads, ratios[: len(workloads) - 1])
+
+
+def _against_naive(suite: str, name: str, **sizes: Any) -> Suite:
+    pair = [Workload("ours", **sizes), Workload("naive", **sizes)]
+    return Suite(suite, pair, [(f"ours / naive, {name}", 0, 1)])
+
+
+def _methods(methods: Sequence[str]) -> Suite:
+    beside = [method for method in methods if method != "ddpg"]
+    workloads = [*(Workload(method=name) for name in beside), Workload(layer_norm=True)]
+    costs = [*(f"cost of {name} / ddpg" for name in beside), "cost of layer norm / none"]
+    ratios = [(name, 0, i) for i, name in enumerate(costs, start=1)]
+    return Suite("method", [Workload(), *workloads], ratios)
+
+
 def compilation_times(methods: Sequence[str]) -> list[dict[str, Any]]:
-    """What compiling each method costs with an empty cache, and with one that holds it."""
-    found = []
+    """Seconds to compile each method with an empty cache, and with one that holds it."""
+    times = []
     with tempfile.TemporaryDirectory() as folder:
         for method, cache in itertools.product(methods, ("cold", "warm")):
             workload = Workload(method=method, devices=measuring.cores())
             worker = measuring.start(workload, 250, JAX_COMPILATION_CACHE_DIR=folder)
             seconds = worker.facts["compile_seconds"]
             worker.stop()
-            found.append({"method": method, "cache": cache, "compile_seconds": seconds})
-    return found
+            times.append({"method": method, "cache": cache, "compile_seconds": seconds})
+    return times
 
 
 def main(options: Options) -> int:
-    """Measure, print and write."""
+    """Measure, print and write; returns the exit code."""
     console = Console(width=None if sys.stdout.isatty() else 120)
     devices = options.devices or measuring.cores()
     rounds = options.rounds or (3 if options.quick else 5)
     everything = list(suites(devices, options.methods, options.quick))
-    names = list(dict.fromkeys([suite.name for suite in everything] + ["compilation"]))
-    for option, asked, known in (
-        ("suites", options.suites, names),
-        ("methods", options.methods, PAPER_METHODS),
-    ):
-        for name in asked:
-            if name not in known:
-                message = (
-                    f"--{option}: unknown {option[:-1]} {name!r}; there are {', '.join(known)}"
-                )
-                print(f"seeds_per_second: {message}", file=sys.stderr)
-                return 2
+    refusal = _refusal(options, everything)
+    if refusal is not None:
+        print(f"seeds_per_second: {refusal}", file=sys.stderr)
+        return 2
     result: dict[str, Any] = {
         **measuring.heading("seeds_per_second"),
         "records": [],
@@ -146,13 +155,13 @@ def main(options: Options) -> int:
     for suite in everything:
         if options.suites and suite.name not in options.suites:
             continue
-        found = measuring.measure(suite.workloads, rounds, compile_together=options.quick)
-        result["records"] += [{"suite": suite.name, **record.fields()} for record in found]
+        records = measuring.measure(suite.workloads, rounds, compile_together=options.quick)
+        result["records"] += [{"suite": suite.name, **record.fields()} for record in records]
         for name, above, below in suite.ratios:
-            ratio = measuring.compare(suite.name, name, found[above].rates, found[below].rates)
+            ratio = measuring.compare(suite.name, name, records[above].rates, records[below].rates)
             console.print(_line(ratio), highlight=False, soft_wrap=True)
             result["comparisons"].append(dataclasses.asdict(ratio))
-        # After each suite: the whole takes most of an hour, and none of it should be lost.
+        # After each suite: the whole takes more than an hour, and an end in between keeps the rest.
         write(result, options.json)
     if "compilation" in (options.suites or ("compilation",)) and not options.quick:
         result["compilation"] = compilation_times(options.methods)
@@ -161,8 +170,22 @@ def main(options: Options) -> int:
     return 0
 
 
+def _refusal(options: Options, everything: Sequence[Suite]) -> str | None:
+    """What is wrong with the options, or None."""
+    suite_names = list(dict.fromkeys([suite.name for suite in everything] + ["compilation"]))
+    for option, asked, known in (
+        ("suites", options.suites, suite_names),
+        ("methods", options.methods, PAPER_METHODS),
+    ):
+        for name in asked:
+            if name not in known:
+                there = ", ".join(known)
+                return f"--{option}: unknown {option[:-1]} {name!r}; there are {there}"
+    return None
+
+
 def write(result: dict[str, Any], path: Path | None) -> None:
-    """Write the measurements so far, and draw what there is."""
+    """Write the measurements so far, and draw them."""
     if path is not None:
         measuring.write(result, path)
         plots.growth(result["records"], path.with_suffix(".png"))
@@ -210,4 +233,5 @@ def _line(comparison: Comparison) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Options, prog="python -m benchmarks.seeds_per_second")))
+    options = tyro.cli(Options, prog="python -m benchmarks.seeds_per_second", description=__doc__)
+    sys.exit(main(options))

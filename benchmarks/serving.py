@@ -1,8 +1,8 @@
 """The two ends of a timed loop in a process of its own: `serve` in it, `Worker` outside.
 
-Each loop lives in a separate process, so that it has its own devices, cores, compiler and peak of
-memory, and so that loops can be timed in turn, which cancels the drift of a shared machine. Only
-the standard library is used here: peers import this from environments without this project's.
+Each loop runs in a separate process, with its own devices, cores, compiler and peak of memory. So
+loops can be timed in turn, which cancels the drift of a shared machine. This module needs the
+standard library alone: peers import it from environments in which nothing else is installed.
 """
 
 import contextlib
@@ -23,8 +23,7 @@ except ImportError:  # Windows has no such accounting; the memory is then not re
 
 
 _MARK = "answer: "
-"""Begins the lines that are answers: libraries print as they are imported."""
-
+"""Begins the lines that are answers; libraries print other lines while they are imported."""
 
 _PIN = """
 import os, sys
@@ -34,17 +33,17 @@ os.execv(sys.argv[2], sys.argv[2:])
 
 
 def serve(advance: Callable[[int], Any], steps: int, facts: Callable[[], dict] = dict) -> None:
-    """Time `advance(steps)` whenever asked to, until standard input ends.
+    """Time `advance(steps)` for every line of standard input, which holds the steps, until it ends.
 
     Args:
-        advance: takes so many steps with every learner, and returns when they are done.
+        advance: takes that many steps with every learner, and returns when they are done.
         steps: of the first call, which compiles and is not counted.
-        facts: what else to report after that call.
+        facts: further fields of the report after the first call.
     """
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
 
-    def answer(found: dict[str, Any]) -> None:
-        print(_MARK + json.dumps(found), file=answers)
+    def answer(fields: dict[str, Any]) -> None:
+        print(_MARK + json.dumps(fields), file=answers)
 
     with contextlib.redirect_stdout(sys.stderr):
         began = time.perf_counter()
@@ -71,12 +70,13 @@ class Worker:
     """
 
     def __init__(self, command: Sequence[str], cores: Sequence[int] | None, **environment: str):
-        """Start `command`, on `cores` alone where given and where the system can do that."""
+        """Start `command`, on `cores` alone if given and if the system can pin processes."""
         if cores is not None and hasattr(os, "sched_setaffinity"):
-            # By a first program: pinning in a fork is unsafe where JAX has started its threads.
+            # A small program pins itself and becomes the command: code between fork and exec is
+            # unsafe in a process where JAX has started threads.
             command = [sys.executable, "-c", _PIN, ",".join(map(str, cores)), *command]
         root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-        # A file: a pipe that nobody reads would block a process that complains a lot.
+        # A file, since a pipe that nobody reads would block a process with many messages.
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115
         self._process = subprocess.Popen(
             command,
@@ -90,7 +90,7 @@ class Worker:
 
     @functools.cached_property
     def facts(self) -> dict[str, Any]:
-        """What it reported when its first call was done; waits for that.
+        """What the loop reported after its first call; waits for it.
 
         Raises:
             RuntimeError: with the end of its errors, if it never gets there.
@@ -98,11 +98,11 @@ class Worker:
         return self._answer()
 
     def wait(self) -> None:
-        """Until its first call is done; raises what `facts` raises."""
+        """Wait until the first call is done; raises what `facts` raises."""
         _ = self.facts
 
     def seconds(self, steps: int) -> float:
-        """How long its learners take for so many steps each, after the first call."""
+        """How long the learners take for `steps` steps each, after the first call."""
         self.wait()
         assert self._process.stdin is not None
         self._process.stdin.write(f"{steps}\n")
@@ -127,7 +127,7 @@ class Worker:
 
 
 def _peak() -> int | None:
-    # Linux: what is accounted to a process includes that of the parent it was forked from.
+    # On Linux, getrusage includes the peak of the parent that the process was forked from.
     if sys.platform == "linux":
         with open("/proc/self/status") as status:
             lines = dict(line.split(":", 1) for line in status)

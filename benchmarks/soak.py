@@ -1,4 +1,4 @@
-"""`python -m benchmarks.soak`: thousands of seeds in one process, and what it holds meanwhile."""
+"""`python -m benchmarks.soak`: what a process holds while it trains thousands of seeds."""
 
 import dataclasses
 import subprocess
@@ -19,10 +19,10 @@ from benchmarks import measuring, plots
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How much to run, and where to write what was seen.
+    """How much to run, and where to write the measurements.
 
     Attributes:
-        cells: Cells one after the other: HS-ME-DDPG, smoke preset, with 1, 2, 3, ...
+        cells: Cells to train, one after the other: HS-ME-DDPG, smoke preset, with 1, 2, 3, ...
             demonstrations.
         seeds: Seeds of each cell.
         json: File for the measurements; a plot is drawn beside it.
@@ -34,7 +34,7 @@ class Options:
 
 
 class Sample(NamedTuple):
-    """What the process held at a moment."""
+    """What the process held at one moment."""
 
     seconds: float
     cells: int
@@ -45,7 +45,9 @@ class Sample(NamedTuple):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run and watch; returns the run's exit code."""
-    options = tyro.cli(Options, prog="python -m benchmarks.soak", args=arguments)
+    options = tyro.cli(
+        Options, prog="python -m benchmarks.soak", description=__doc__, args=arguments
+    )
     with tempfile.TemporaryDirectory() as folder:
         code, samples = watch(options, Path(folder) / "run")
     if code:
@@ -70,7 +72,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def watch(options: Options, run: Path) -> tuple[int, list[Sample]]:
-    """Run the cells in a process of their own, saving after every chunk; look at it each second."""
+    """Train the cells in a process of their own, saving after every chunk; sample it each second.
+
+    Returns:
+        The process's exit code and the samples.
+    """
     command = [
         *(sys.executable, "-m", "experiments.run_grid", "--preset", "smoke", "--out", str(run)),
         *("--methods", "hs-me-ddpg", "--seeds", str(options.seeds), "--checkpoint-every", "0"),
@@ -90,19 +96,19 @@ def watch(options: Options, run: Path) -> tuple[int, list[Sample]]:
                 )
             samples.append(sample)
             time.sleep(1.0)
-    # The last look may have met a process that was letting go of what it held.
+    # The last sample may show a process that was already ending.
     return process.returncode, samples[:-1]
 
 
 def growth_per_cell(samples: Sequence[Sample]) -> float:
-    """Slope of the resident bytes over finished cells, once a quarter of the cells is done."""
+    """Slope of the resident bytes over finished cells, after the first quarter of the cells."""
     least = least_per_cell(samples)
     late = [sample for sample in least if sample.cells >= least[-1].cells / 4]
     return float(np.polyfit([s.cells for s in late], [s.resident_bytes for s in late], 1)[0])
 
 
 def least_per_cell(samples: Sequence[Sample]) -> list[Sample]:
-    """Of each number of finished cells the least that was held: not what one needs for a while."""
+    """The least that was held at each number of finished cells: leaves out what is held briefly."""
     by_cell: dict[int, list[Sample]] = {}
     for sample in samples:
         by_cell.setdefault(sample.cells, []).append(sample)

@@ -1,6 +1,7 @@
 """The process that runs one workload: `python -m benchmarks.worker '{"method": "ddpg", ...}'`."""
 
 import json
+import os
 import sys
 
 import jax
@@ -16,7 +17,7 @@ from cmedirl_jax.runs.console import compile_cache
 
 
 def demonstrations(episodes: int) -> Demonstrations:
-    """Episodes of a scripted controller, which solves the task in about as many steps as DDPG."""
+    """Episodes of a scripted controller that solves the task, of about the length of DDPG's."""
     env = envs.make("MountainCarContinuous-v0")
 
     def act(actor: None, observation: jax.Array) -> jax.Array:
@@ -33,7 +34,7 @@ def main() -> None:
     steps = options.pop("steps")
     workload = Workload(**{**options, "hidden": tuple(options["hidden"])})
     jax.config.update("jax_num_cpu_devices", workload.devices)
-    if jax.config.jax_compilation_cache_dir is not None:
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         compile_cache.use_cache()
     variant = {"ours": ours, "naive": naive}[workload.variant]
     with compile_cache.counted() as cost:

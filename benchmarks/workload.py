@@ -1,4 +1,4 @@
-"""What a benchmark runs: one method on so many seeds, at one size."""
+"""What a benchmark runs: one method, a number of seeds, one size."""
 
 import dataclasses
 from typing import Literal
@@ -9,7 +9,7 @@ CAPACITY = 12_000
 
 @dataclasses.dataclass(frozen=True)
 class Workload:
-    """A training loop to time. The defaults are the sizes that the project's targets name.
+    """A training loop to time. The defaults are the sizes of the quoted rates.
 
     Attributes:
         variant: The library's training loop, or the plain reference.
@@ -18,7 +18,7 @@ class Workload:
         hidden: Units of each hidden layer of every network.
         batch: Transitions per update.
         layer_norm: Layer normalisation in the critic.
-        devices: 1: one device on one core; more: so many devices on all cores.
+        devices: 1 is one device on one core; more are that many devices on all cores.
         n_demos: Demonstrated trajectories per learner.
         group: Seeds vmapped together; None: the library's choice.
         running: Share of the seeds that have not ended.

@@ -7,12 +7,29 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-README = Path(__file__).parents[1] / "README.md"
-METHOD = README.parent / "docs" / "method.md"
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+OTHER_PAGES = [ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "docs/results/README.md"]
+LINK = re.compile(r"\]\(([^)#\s]+\.\w+)[)#]")
+PATH = re.compile(r"`((?:cmedirl_jax|experiments|benchmarks|tests|docs)/[\w./-]*)`")
 
 
 def blocks(page):
     return re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
+
+
+def run(code):
+    names = {}
+    exec(compile(code, "<example>", "exec"), names)
+    return names
+
+
+EXAMPLES = [
+    pytest.param(code, id=f"{page.stem}-{number}")
+    for page in PAGES
+    for number, code in enumerate(blocks(page))
+]
 
 
 def test_the_quick_start_is_two_one_line_commands():
@@ -24,16 +41,38 @@ def test_the_quick_start_is_two_one_line_commands():
     assert "python -m pytest\n" in commands[1]
 
 
-@pytest.mark.parametrize("code", [*blocks(README), *blocks(METHOD)])
+def test_readme_is_a_front_page():
+    lines = README.read_text().splitlines()
+    assert len(lines) <= 130
+    assert lines.index("```python") <= 50
+
+
+@pytest.mark.parametrize("code", EXAMPLES)
 def test_the_examples_run(code):
-    names = {}
-    exec(compile(code, "<example>", "exec"), names)
+    names = run(code)
     arrays = [leaf for leaf in jax.tree.leaves(list(names.values())) if isinstance(leaf, jax.Array)]
     numbers = [leaf for leaf in arrays if jnp.issubdtype(leaf.dtype, jnp.floating)]
     assert numbers
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in numbers)
 
 
+def test_readmes_reward_prefers_what_the_demonstrator_does():
+    names = run(blocks(README)[0])
+    learner, state, shown = names["learner"], names["state"], names["shown"]
+    demonstrated = learner.reward(state, shown.observation, shown.action)
+    opposite = learner.reward(state, shown.observation, -shown.action)
+    assert jnp.mean(demonstrated > opposite) > 0.95
+    assert names["info"].demonstration_reward[-1] > names["info"].background_reward[-1] + 0.05
+
+
 def test_there_are_examples():
-    assert len(blocks(README)) >= 2
-    assert len(blocks(METHOD)) == 1
+    assert len(blocks(README)) == 1
+    assert len(EXAMPLES) >= 6
+
+
+@pytest.mark.parametrize("page", [*PAGES, *OTHER_PAGES], ids=lambda page: page.stem)
+def test_links_and_paths_lead_somewhere(page):
+    text = page.read_text()
+    linked = [page.parent / link for link in LINK.findall(text) if "://" not in link]
+    named = [ROOT / path for path in PATH.findall(text)]
+    assert [path for path in linked + named if not path.exists()] == []

@@ -1,4 +1,4 @@
-"""TD3 of rejax on gymnax's environment, its seeds vmapped as its documentation does."""
+"""TD3 of rejax on gymnax's environment; seeds are vmapped as in its documentation."""
 
 import sys
 
@@ -20,7 +20,7 @@ algorithm = TD3.create(
     target_update_freq=1,
     skip_initial_evaluation=True,
 )
-# Its evaluation of 128 episodes is left out: none of the loops here evaluates.
+# Without its evaluation of 128 episodes: none of the loops here evaluates.
 algorithm = algorithm.replace(eval_callback=lambda *_: ())
 
 

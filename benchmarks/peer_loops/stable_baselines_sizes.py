@@ -1,4 +1,4 @@
-"""What stable-baselines3 and sbx are given alike, so that they do the work that ours does."""
+"""Options that give stable-baselines3 and sbx the same work as our loop."""
 
 import numpy as np
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise

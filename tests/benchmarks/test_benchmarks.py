@@ -108,8 +108,9 @@ rates = st.lists(st.floats(1e-3, 1e6), min_size=1, max_size=9)
 @given(rates, st.floats(1e-3, 1e3), st.randoms())
 def test_a_ratio_does_not_notice_a_machine_whose_speed_drifts(speeds, ratio, random):
     below = [speed * random.uniform(0.5, 2.0) for speed in speeds]
-    found = measuring.compare("suite", "name", [ratio * rate for rate in below], below)
-    np.testing.assert_allclose([found.median, found.low, found.high], ratio, rtol=1e-6)
+    ratio_of_rates = measuring.compare("suite", "name", [ratio * rate for rate in below], below)
+    measured = [ratio_of_rates.median, ratio_of_rates.low, ratio_of_rates.high]
+    np.testing.assert_allclose(measured, ratio, rtol=1e-6)
 
 
 @pytest.mark.parametrize("variant", [ours, naive])
@@ -320,17 +321,17 @@ def fake_training(monkeypatch):
             if checkpointer is not None:
                 checkpointer.save_if_due(step, lambda: ({"weight": weight}, {"step": np.ones(1)}))
 
-    monkeypatch.setattr(checkpoint_cost.cells, "train", train)
+    monkeypatch.setattr(checkpoint_cost.cell_lib, "train", train)
 
 
 def test_checkpoints_are_counted_and_their_cost_is_of_the_time_without(fake_training):
     options = checkpoint_cost.Options(every=0.03, rounds=3)
-    found = checkpoint_cost.measure(options, compiled=None)
-    assert 3 <= found["checkpoints"] <= 3 * 4
-    assert 8_000 <= found["checkpoint_bytes"] < 20_000
-    assert found["cost_low"] <= found["cost"] <= found["cost_high"]
-    assert found["cost_by_default"] == pytest.approx(found["cost"] * 0.03 / 60)
-    assert found["blocked_seconds"] > 0.0
+    costs = checkpoint_cost.measure(options, compiled=None)
+    assert 3 <= costs["checkpoints"] <= 3 * 4
+    assert 8_000 <= costs["checkpoint_bytes"] < 20_000
+    assert costs["cost_low"] <= costs["cost"] <= costs["cost_high"]
+    assert costs["cost_by_default"] == pytest.approx(costs["cost"] * 0.03 / 60)
+    assert costs["blocked_seconds"] > 0.0
 
 
 def test_a_run_too_short_for_a_checkpoint_says_so(fake_training):

@@ -53,7 +53,7 @@ def compile_networks(
 
     Apart from `compile_method`, because the random numbers are most of what an `init` compiles.
     """
-    trainer = training.make(env, METHODS["ddpg"], Settings(architecture), capacity=1)
+    trainer = training.make(env, METHODS["ddpg"], Settings(architecture=architecture), capacity=1)
     drawn = seeds.step_groups(lambda key: (key, trainer.draw_networks(key)), group)
 
     def draw(keys: jax.Array, groups: int) -> Any:
