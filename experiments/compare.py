@@ -1,8 +1,8 @@
 """`python -m experiments.compare FOLDER`: each cell of a run against one of them, seed by seed.
 
-Seeds are paired: seed i of every method draws the same networks, starts and noise. So the
-differences are of pairs, their intervals bootstrapped over pairs, their p-values from flipping
-the signs of pairs, adjusted for the number of cells by Holm's method.
+Seeds are paired: seed i of every method draws the same networks, starts and noise. Differences are
+therefore taken within pairs. Intervals are bootstrapped over pairs; p-values come from flipping the
+signs of pairs, and are adjusted for the number of cells by Holm's method.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ MEASURES: dict[str, Callable[[SeedStatistics, int], np.ndarray]] = {
     "area": lambda seeds, most: seeds.area,
     "final_return": lambda seeds, most: seeds.final_return,
 }
-"""What is compared; a seed that never converged counts as having done so at the last step."""
+"""The measures compared. A seed that never converged counts as converged at the last step."""
 
 RESAMPLES = 9_999
 
@@ -106,7 +106,7 @@ def compare(folder: Path, against: str) -> pl.DataFrame:
         raise UserError(f"{folder}: holds no method beside {against} to compare with it")
     rows = []
     for name, measure in MEASURES.items():
-        found = [
+        differences = [
             {
                 "method": method,
                 "n_demos": n_demos,
@@ -115,14 +115,14 @@ def compare(folder: Path, against: str) -> pl.DataFrame:
             }
             for (method, n_demos), (seeds, reference) in pairs.items()
         ]
-        adjusted = holm(np.array([row["p_value"] for row in found]))
-        rows += [row | {"p_holm": p} for row, p in zip(found, adjusted, strict=True)]
+        adjusted = holm(np.array([row["p_value"] for row in differences]))
+        rows += [row | {"p_holm": p} for row, p in zip(differences, adjusted, strict=True)]
     return pl.DataFrame(rows)
 
 
 @contextlib.contextmanager
 def _undamaged(folder: Path) -> Iterator[None]:
-    """Turn whatever json, polars or numpy stumble over in a damaged file into a user's error."""
+    """Turn any error that json, polars or numpy raise for a damaged file into a user's error."""
     try:
         yield
     except UserError:
@@ -186,10 +186,10 @@ def shown(table: pl.DataFrame, against: str) -> Table:
         printed.add_column("p (Holm)", justify="right")
     for (method, n_demos), group in table.group_by("method", "n_demos", maintain_order=True):
         row = []
-        for found in group.iter_rows(named=True):
-            form = "{:+,.0f}" if found["measure"] == "convergence_env_step" else "{:+.1f}"
-            numbers = (found[f"difference{end}"] for end in ("", "_low", "_high"))
-            row += ["{} [{}, {}]".format(*map(form.format, numbers)), f"{found['p_holm']:.4f}"]
+        for paired in group.iter_rows(named=True):
+            form = "{:+,.0f}" if paired["measure"] == "convergence_env_step" else "{:+.1f}"
+            numbers = (paired[f"difference{end}"] for end in ("", "_low", "_high"))
+            row += ["{} [{}, {}]".format(*map(form.format, numbers)), f"{paired['p_holm']:.4f}"]
         printed.add_row(str(method), str(n_demos) if n_demos else "-", *row)
     return printed
 
