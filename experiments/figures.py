@@ -174,7 +174,7 @@ def _band(
     label = METHODS[method].label or method
     if len(intervals) == 1:
         # A method that never interacts has the same return at every step.
-        axes.axhline(intervals[0, 0], **line | {"linestyle": "-."}, label=label)
+        axes.axhline(intervals[0, 0], color=line["color"], linestyle="-.", label=label)
         return
     axes.plot(points[x], intervals[:, 0], **line, label=label)
     axes.fill_between(

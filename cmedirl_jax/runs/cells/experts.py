@@ -1,4 +1,4 @@
-"""Demonstrations as the paper makes them: DDPG experts trained on the true reward (section 4.1)."""
+"""Demonstrations as in the paper: by DDPG experts trained on the true reward (section 4.1)."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells.cell import Progress
 from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.record import Budget
-from cmedirl_jax.runs.cluster import exchange
+from cmedirl_jax.runs.cluster.base import ALONE, Cluster
 from cmedirl_jax.runs.config import Expert, ExpertSettings
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
@@ -32,6 +32,7 @@ def make_pool(
     programs: CompiledMethod,
     report: Callable[[Progress], None],
     checkpointer: Checkpointer | None = None,
+    cluster: Cluster = ALONE,
 ) -> Demonstrations:
     """Train experts and record noise-free trajectories, from fresh random starts.
 
@@ -43,11 +44,13 @@ def make_pool(
         programs: DDPG's, with the settings that experts train with.
         report: called after each chunk of training.
         checkpointer: saves the training as it goes.
+        cluster: the processes of the run.
 
     Raises:
         Interrupted: by the checkpointer.
         UserError: if no expert's final policy reaches the environment's threshold.
     """
+    # Train.
     train_key, start_key = jax.random.split(key)
     threshold = env.spec.reward_threshold
     result = cell_lib.train(
@@ -61,6 +64,7 @@ def make_pool(
         report=report,
         checkpointer=checkpointer,
     )
+    # Choose who demonstrates, by the final policies' returns.
     final = result.evaluations[-1]
     returns = np.where(result.diverged, -np.inf, 0.0)
     alive = ~result.diverged[final.seed]
@@ -72,6 +76,7 @@ def make_pool(
             f"{options.steps} steps; give them more steps (--experts.steps) or seeds, "
             "and the run another folder"
         )
+    # Record.
     actors = jax.tree.map(lambda leaf: jnp.asarray(leaf[chosen]), result.final)
     per_expert = -(-options.trajectories // chosen.size)
 
@@ -92,10 +97,11 @@ def make_pool(
 
     def recorded() -> Demonstrations:
         columns = record_all(actors, jax.random.split(start_key, chosen.size))
-        return flatten(*jax.tree.map(np.asarray, columns), metadata)
+        transition, running, truncated = jax.tree.map(np.asarray, columns)
+        return flatten(transition, running, truncated, metadata)
 
-    # Once for all processes: another kind of machine might round to episodes of other lengths.
-    pool = exchange.pool_from_writer(recorded)
+    # On one process for all: rounding on another machine might give episodes of other lengths.
+    pool = cluster.pool_from_writer(recorded)
     assert pool is not None
     return pool
 
