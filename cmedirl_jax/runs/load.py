@@ -78,7 +78,7 @@ def load_policy(
         table = learned.parameters("policies", mdp.reward, seed)
         return discretise.greedy(mdp, table)
     made = networks.make(task, settings.architecture)
-    actor = learned.parameters("policies", jax.eval_shape(made.actor.init, _KEY), seed)
+    actor = learned.parameters("policies", _abstract(made.actor.init), seed)
     return lambda observation: networks.policy(made, actor, jnp.asarray(observation))
 
 
@@ -117,14 +117,16 @@ def load_reward(
         made = compose.compose(task, learned.method, settings, task.max_episode_steps)
         assert made.learner is not None
         learner = made.learner
-        params = learned.parameters("rewards", jax.eval_shape(learner.init, _KEY).params, seed)
+        params = learned.parameters("rewards", _abstract(learner.init).params, seed)
     state = learner.init(jax.random.key(0)).replace(params=params)
     return lambda observation, action: learner.reward(
         state, jnp.asarray(observation), jnp.asarray(action)
     )
 
 
-_KEY = jax.eval_shape(lambda: jax.random.key(0))
+def _abstract(init: Callable[[jax.Array], Any]) -> Any:
+    """The structure and shapes of the parameters that `init` draws."""
+    return jax.eval_shape(lambda: init(jax.random.key(0)))
 
 
 def _find(

@@ -8,7 +8,7 @@ import pytest
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import atomic, checkpoint
 from cmedirl_jax.runs.console.signals import Interruption
-from cmedirl_jax.runs.storage.checkpoints import Keeper
+from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from tests.support import pools
 
 
@@ -63,9 +63,11 @@ def test_demonstrations_are_flushed(tmp_path, events):
 
 @needs_proc
 def test_checkpoints_are_flushed(tmp_path, events):
-    with Keeper(tmp_path, {}, every=0.0, interruption=Interruption(), say=pytest.fail) as keeper:
-        keeper.visit(250, lambda: ({"weights": np.zeros(3)}, {"rows": np.arange(2)}))
-    assert_safe(events, tmp_path / "250", tmp_path / ".partial")
+    with Checkpointer(
+        tmp_path, {}, every=0.0, interruption=Interruption(), say=pytest.fail
+    ) as checkpointer:
+        checkpointer.save_if_due(250, lambda: ({"weights": np.zeros(3)}, {"rows": np.arange(2)}))
+    assert_safe(events, tmp_path / "250", tmp_path / ".250.partial")
 
 
 @needs_proc

@@ -18,7 +18,8 @@ from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells.cell import CellResult, Progress
 from cmedirl_jax.runs.cells.record import Budget
-from cmedirl_jax.runs.console.signals import Interrupted, Interruption
+from cmedirl_jax.runs.console.signals import Interruption
+from cmedirl_jax.runs.errors import Interrupted
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.training import Log
 from cmedirl_jax.training.methods import METHODS
@@ -496,7 +497,7 @@ def test_a_cell_goes_on_with_a_seed_that_has_diverged(programs, tmp_path):
     assert_same_results(rest.result, whole.result)
 
 
-def test_a_cell_goes_on_in_other_lanes(programs, by_episodes, tmp_path):
+def test_a_cell_goes_on_in_other_slots(programs, by_episodes, tmp_path):
     with pytest.raises(Interrupted):
         train(programs, BY_EPISODES, checkpointer=checkpointer(tmp_path, stop_after=3))
     wider = programs._replace(slots=programs.slots + 2)
