@@ -135,7 +135,7 @@ def _find(
     try:
         finished = cells.finished(Path(run))
     except UserError as error:
-        raise ValueError(str(error).removeprefix("--out: ")) from error
+        raise ValueError(str(error)) from error
     if not finished:
         raise ValueError(f"{run}: holds no finished cell of a run")
 

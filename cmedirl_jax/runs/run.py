@@ -236,15 +236,21 @@ def _within_memory(folder: Path) -> Iterator[None]:
 def _train_cells(session: _Session, todo: Sequence[Cell]) -> None:
     """Make the demonstrations if they are missing, and train the cells, with live progress."""
     plan, cluster = session.plan, session.cluster
-    stored = cluster.pool_from_writer(
-        lambda: stored_demonstrations.load(plan.folder, plan.env.spec)
-    )
+
+    def load_stored() -> Demonstrations | None:
+        with run_folder.naming_the_option():
+            return stored_demonstrations.load(plan.folder, plan.env.spec)
+
+    # The demonstrations, and how many steps there are to train.
+    stored = cluster.pool_from_writer(load_stored)
     pool = stored if plan.demos is None else plan.demos
     trains_experts = pool is None and any(cell.n_demos for cell in todo)
     if pool is not None:
         plan.check_enough(pool)
     steps = sum(len(cell.block) * plan.budget.max_steps for cell in todo if cell.method.interacts)
     steps += plan.experts.seeds * plan.experts.steps * trains_experts
+
+    # Experts if they are needed, then the cells.
     with reporter(session.console, len(todo) + trains_experts, steps) as report:
         if trains_experts:
             report.start(f"experts, {plan.experts.seeds} seeds")

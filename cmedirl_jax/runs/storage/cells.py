@@ -153,12 +153,12 @@ def finished(folder: Path) -> list[SavedCell]:
         except (sealing.Damaged, KeyError, TypeError) as error:
             reason = error if isinstance(error, sealing.Damaged) else "is no cell of a run"
             raise UserError(
-                f"--out: {path} {reason}; bring it back, or remove it to train the cell again"
+                f"{path} {reason}; bring it back, or remove it to train the cell again"
             ) from error
         except sealing.OtherSchema as error:
-            raise UserError(f"--out: {path} {error}") from error
+            raise UserError(f"{path} {error}") from error
         except OSError as error:
-            raise UserError(f"--out: {path} cannot be read ({error.strerror})") from error
+            raise UserError(f"{path} cannot be read ({error.strerror})") from error
     return cells
 
 

@@ -31,7 +31,7 @@ def load(folder: Path, spec: EnvSpec) -> Demonstrations | None:
         return demonstrations.load(path / FILE, spec)
     except sealing.Damaged as error:
         raise UserError(
-            f"--out: {path} {error}; bring it back, or remove it to train the experts again"
+            f"{path} {error}; bring it back, or remove it to train the experts again"
         ) from error
     except (OSError, ValueError, sealing.OtherSchema) as error:
-        raise UserError(f"--out: {path}: {error}") from error
+        raise UserError(f"{path}: {error}") from error

@@ -91,7 +91,8 @@ def opened(folder: Path, config: dict[str, Any]) -> Iterator[list[cells.SavedCel
         try:
             # Once more: another process may have been here since.
             check(folder, config)
-            finished = cells.finished(folder)
+            with naming_the_option():
+                finished = cells.finished(folder)
             _remove_unfinished(folder)
             if not (folder / "config.json").exists():
                 _write(folder, {"schema": sealing.SCHEMA, "config": config, "versions": versions()})
@@ -124,6 +125,15 @@ def held(folder: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+@contextlib.contextmanager
+def naming_the_option() -> Iterator[None]:
+    """Put the option that names the folder before what is wrong in it."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"--out: {error}") from error
 
 
 def _remove_unfinished(folder: Path) -> None:
@@ -177,10 +187,10 @@ def read(folder: Path) -> dict[str, Any]:
         raise UserError(f"{folder}: holds no run (there is no config.json)") from error
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise UserError(f"--out: {path} is not a readable configuration ({reason})") from error
+        raise UserError(f"{path} is not a readable configuration ({reason})") from error
     if schema != sealing.SCHEMA:
         raise UserError(
-            f"--out: {path} has schema {schema!r}, this version writes {sealing.SCHEMA}: another "
+            f"{path} has schema {schema!r}, this version writes {sealing.SCHEMA}: another "
             "version began the run; finish it with that one, or choose another folder"
         )
     return written
@@ -205,7 +215,8 @@ def identity(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _compare(folder: Path, config: dict[str, Any]) -> None:
-    before, now = _flat(read(folder)["config"]), _flat(config)
+    with naming_the_option():
+        before, now = _flat(read(folder)["config"]), _flat(config)
     for name in sorted(before.keys() | now.keys()):
         if name not in _NOT_COMPARED and before.get(name) != now.get(name):
             raise UserError(

@@ -61,7 +61,7 @@ def test_a_damaged_cell_is_refused_in_a_line(tmp_path, name):
     with pytest.raises(UserError) as refused:
         cells.finished(tmp_path)
     assert str(refused.value) == (
-        f"--out: {path} is damaged ({name}); bring it back, or remove it to train the cell again"
+        f"{path} is damaged ({name}); bring it back, or remove it to train the cell again"
     )
 
 

@@ -33,6 +33,7 @@ def test_a_run_that_keeps_none_yet_has_none(tmp_path):
 def test_another_valid_pool_in_its_place_is_refused(folder):
     demonstrations.save(folder / "pool.npz", pools.scripted(4))
     with pytest.raises(UserError, match=r"^--out: .*demonstrations is damaged \(pool\.npz\)"):
+    with pytest.raises(UserError, match=r"^.*demonstrations is damaged \(pool\.npz\)"):
         stored_demonstrations.load(folder.parent, SPEC)
 
 
@@ -51,5 +52,5 @@ def test_a_damaged_seal_is_refused(folder, content):
 
 
 def test_a_pool_of_another_task_is_refused(folder):
-    with pytest.raises(UserError, match=r"^--out: .*made for environment"):
+    with pytest.raises(UserError, match=r".*made for environment"):
         stored_demonstrations.load(folder.parent, SPEC._replace(id="Pendulum-v1"))
