@@ -12,15 +12,16 @@ from polars.testing import assert_frame_equal
 
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import checkpoint
+from cmedirl_jax.runs import load_policy, load_reward, start, validation
 from cmedirl_jax.runs import run as run_lib
-from cmedirl_jax.runs import start, validation
 from cmedirl_jax.runs.cells import experts
 from cmedirl_jax.runs.cluster.base import ALONE
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import tables
+from cmedirl_jax.training import evaluation
 from cmedirl_jax.training.methods import METHODS
-from experiments import run_grid
+from experiments import report, run_grid
 from tests.support import ROOT, pools
 
 SMOKE = ("--preset", "smoke")
@@ -488,6 +489,51 @@ def test_figures_that_are_gone_are_drawn_again(smoke, main, tmp_path):
     assert main(*SMOKE, "--out", folder) == 0
     assert (folder / "figures" / "figure3.png").exists()
     assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
+
+
+def test_a_report_makes_tables_and_figures_again_without_training(smoke, tmp_path, capsys):
+    folder = shutil.copytree(smoke[0], tmp_path / "run")
+    figures = snapshot(folder / "figures")
+    for name in (*TABLES, "summary.csv"):
+        (folder / name).write_bytes(b"damaged")
+    (folder / "figures" / "figure3.png").unlink()
+    assert report.main([str(folder)]) == 0
+    assert capsys.readouterr().out == f"Tables and figures: {folder}\n"
+    for name in (*TABLES, "summary.csv"):
+        assert (folder / name).read_bytes() == (smoke[0] / name).read_bytes()
+    assert snapshot(folder / "figures") == figures
+
+
+def test_a_report_of_what_is_no_finished_run_is_refused(smoke, tmp_path, capsys):
+    def refused(folder):
+        assert report.main([str(folder)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line
+
+    assert refused(tmp_path) == f"report: {tmp_path}: holds no run (there is no config.json)"
+    shutil.copy(smoke[0] / "config.json", tmp_path)
+    assert refused(tmp_path) == f"report: {tmp_path}: holds no finished cell of a run"
+    folder = shutil.copytree(smoke[0], tmp_path / "run")
+    with run_folder.held(folder):
+        assert "another process is at work" in refused(folder)
+    name = CELLS["ddpg", 0]
+    (folder / "cells" / name / "seeds.parquet").unlink()
+    assert f"{name} is damaged (seeds.parquet)" in refused(folder)
+
+
+def test_policies_and_rewards_of_a_run_are_functions(smoke, env):
+    """The best policy returns what its evaluations say."""
+    folder, _ = smoke
+    act = load_policy(folder, "hs-me-ddpg", seed=2)
+    found = evaluation.evaluate(jax.jit(act), env, env.default_params, 10)
+    table = pl.read_parquet(folder / "evaluations.parquet").filter(
+        pl.col("method") == "hs-me-ddpg", pl.col("seed") == 2
+    )
+    assert float(found.return_mean) == pytest.approx(table["return_mean"].max(), abs=1e-3)
+    observation, action = np.zeros((4, 2), np.float32), np.zeros((4, 1), np.float32)
+    r_d = load_reward(folder, "hs-me-ddpg", seed=2)(observation, action)
+    assert r_d.shape == (4,)
+    assert (np.abs(r_d) <= 0.1).all()
 
 
 def test_a_finished_run_refuses_another_configuration(smoke, main, capsys):
