@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import tyro
@@ -85,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def measure(options: Options, compiled: CompiledMethod) -> dict[str, object]:
+def measure(options: Options, compiled: CompiledMethod) -> dict[str, Any]:
     """Train the cell with and without, in turn.
 
     Raises:
@@ -110,7 +111,7 @@ def measure(options: Options, compiled: CompiledMethod) -> dict[str, object]:
         return time.perf_counter() - began
 
     seconds(None)
-    ratios, checkpointers = [], []
+    ratios, checkpointers, size, kept = [], [], 0, 1
     with tempfile.TemporaryDirectory() as folder:
         for number in range(options.rounds):
             checkpointer = _Timed(

@@ -62,7 +62,7 @@ class State(NamedTuple):
     reward: Any
     reward_optimizer: Any
     replay: dict[str, jax.Array]
-    count: jax.Array
+    taken: jax.Array
     env: Any
     observation: jax.Array
     noise: jax.Array
@@ -73,9 +73,10 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
     method = METHODS[workload.method]
     env = envs.make("MountainCarContinuous-v0")
     params = env.default_params
-    actor = Network(workload.hidden)
-    critic = Network(workload.hidden, workload.layer_norm)
-    reward = Network(workload.hidden)
+    # Any: by its type, Linen's `apply` might also return variables.
+    actor: Any = Network(workload.hidden)
+    critic: Any = Network(workload.hidden, workload.layer_norm)
+    reward: Any = Network(workload.hidden)
     actor_tx, critic_tx, reward_tx = optax.adam(1e-4), optax.adam(1e-3), optax.adam(1e-3)
     demonstrated = jax.tree.map(jnp.asarray, (pool.transition.observation, pool.transition.action))
 
@@ -105,7 +106,7 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
                 "next_observation": jnp.zeros((CAPACITY, 2)),
                 "terminated": jnp.zeros(CAPACITY, bool),
             },
-            count=jnp.zeros((), jnp.int32),
+            taken=jnp.zeros((), jnp.int32),
             env=env_state,
             observation=first,
             noise=jnp.zeros(1),
@@ -121,7 +122,7 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         demonstration_key, background_key = jax.random.split(key)
         rows = jax.random.randint(demonstration_key, (workload.batch,), 0, len(demonstrated[0]))
         expert = jax.tree.map(lambda leaf: leaf[rows], demonstrated)
-        index = jax.random.randint(background_key, (workload.batch,), 0, state.count)
+        index = jax.random.randint(background_key, (workload.batch,), 0, state.taken)
         background = state.replay["observation"][index], state.replay["action"][index]
 
         def loss(reward_params):
@@ -140,7 +141,7 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
 
     def update_agent(state: State, key) -> Agent:
         agent = state.agent
-        index = jax.random.randint(key, (workload.batch,), 0, state.count)
+        index = jax.random.randint(key, (workload.batch,), 0, state.taken)
         batch = {name: field[index] for name, field in state.replay.items()}
         rewards = batch["reward"]
         if method.learns_reward:
@@ -194,7 +195,7 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
             "next_observation": result.observation,
             "terminated": result.terminated,
         }
-        position = state.count % CAPACITY
+        position = state.taken % CAPACITY
         replay = {name: field.at[position].set(row[name]) for name, field in state.replay.items()}
         done = result.terminated | result.truncated
         fresh_env, fresh_observation = env.reset(keys[3], params)
@@ -206,7 +207,7 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
         state = state._replace(
             key=keys[0],
             replay=replay,
-            count=state.count + 1,
+            taken=state.taken + 1,
             env=env_state,
             observation=observation,
             noise=noise,
@@ -219,7 +220,7 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
                 state,
             )
         agent = jax.lax.cond(
-            state.count >= LEARNING_STARTS,
+            state.taken >= LEARNING_STARTS,
             lambda state: update_agent(state, keys[5]),
             lambda state: state.agent,
             state,

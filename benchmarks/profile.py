@@ -130,9 +130,9 @@ def main(options: Options) -> int:
             for plane in planes
             for line in plane.lines
         ]
-    kind_of = kinds(program.as_text())
-    spent: dict[str, float] = collections.Counter()
-    operations: dict[str, int] = collections.Counter()
+    kind_of = kinds(program.as_text() or "")
+    spent: dict[str, float] = collections.defaultdict(float)
+    operations: dict[str, int] = collections.defaultdict(int)
     for thread in threads:
         for name, duration in self_times(thread):
             kind = kind_of.get(name, "control")

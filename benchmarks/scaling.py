@@ -25,7 +25,8 @@ from benchmarks import measuring, ours
 from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells.slots import Slots
-from cmedirl_jax.runs.cluster import exchange
+from cmedirl_jax.runs.cluster.base import ALONE, Cluster
+from cmedirl_jax.runs.cluster.together import Together
 from cmedirl_jax.training import seeds
 from cmedirl_jax.training.settings import Settings
 
@@ -108,11 +109,15 @@ def start(job: dict[str, Any]) -> subprocess.Popen:
 
 def turn(workers: list[subprocess.Popen]) -> dict[str, float]:
     """One chunk of a group; the times that its first process measured."""
+    lines = []
     for worker in workers:
+        assert worker.stdin is not None
         worker.stdin.write("go\n")
         worker.stdin.flush()
-    # The transport of the collectives prints too.
-    lines = [next(line for line in worker.stdout if line.startswith("{")) for worker in workers]
+    for worker in workers:
+        assert worker.stdout is not None
+        # The transport of the collectives prints too.
+        lines.append(next(line for line in worker.stdout if line.startswith("{")))
     return json.loads(lines[0])
 
 
@@ -126,10 +131,11 @@ def work(
 ) -> None:
     """Train a chunk whenever a line comes, and print how long that took, as JSON."""
     jax.config.update("jax_num_cpu_devices", devices)
+    cluster: Cluster = ALONE
     if processes > 1:
         jax.distributed.initialize(coordinator, processes, index)
-    spread_over = exchange.devices(devices, seeds_count)
-    exchange.connect(spread_over)
+        cluster = Together()
+    spread_over = cluster.devices(devices, seeds_count)
     programs = ours.compile_programs(method, Settings(), spread_over, seeds_count=seeds_count)
     slots = Slots(programs.slots, seeds_count, programs.group, programs.devices)
     state = compiled_lib.begin(programs, slots, jax.random.key(0), None, 0)
@@ -140,6 +146,7 @@ def work(
         for n in (EXTRA_FLOATS if processes > 1 else ())
     ]
     begun, warm = 0, False
+    times: dict[str, float] = {}
     for _ in sys.stdin:
         # The first turn compiles, and its first chunk learns nothing before step 200.
         for last in (True,) if warm else (False, False, True):
@@ -148,22 +155,22 @@ def work(
             before = time.perf_counter()
             state, log = jax.block_until_ready(programs.run(state, groups, None, steps, None))
             times["chunk_s"] = time.perf_counter() - before
-            timed(times, "gather", log)
+            timed(cluster, times, "gather", log)
             times["gather_bytes"] = sum(leaf.nbytes for leaf in jax.tree.leaves(log))
             for array in extra:
-                timed(times, f"gather_{array.nbytes}_bytes", array)
+                timed(cluster, times, f"gather_{array.nbytes}_bytes", array)
             before = time.perf_counter()
-            exchange.any_process(False)
+            cluster.any(False)
             times["flag_s"] = time.perf_counter() - before
             begun += cell_lib.CHUNK
             warm = last
         print(json.dumps(times), flush=True)
 
 
-def timed(times: dict[str, float], name: str, tree: Any) -> None:
+def timed(cluster: Cluster, times: dict[str, float], name: str, tree: Any) -> None:
     """Gather a tree; note the seconds."""
     before = time.perf_counter()
-    exchange.gather(tree)
+    cluster.gather(tree)
     times[f"{name}_s"] = time.perf_counter() - before
 
 

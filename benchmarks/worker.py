@@ -33,7 +33,7 @@ def main() -> None:
     steps = options.pop("steps")
     workload = Workload(**{**options, "hidden": tuple(options["hidden"])})
     jax.config.update("jax_num_cpu_devices", workload.devices)
-    if jax.config.jax_compilation_cache_dir is not None:
+    if jax.config.jax_compilation_cache_dir is not None:  # pyright: ignore[reportAttributeAccessIssue]
         compile_cache.use_cache()
     variant = {"ours": ours, "naive": naive}[workload.variant]
     with compile_cache.counted() as cost:
