@@ -62,12 +62,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         work(**json.loads(arguments[1]))
         return 0
     options = tyro.cli(Options, prog="python -m benchmarks.scaling", args=arguments)
-    found = measure(options.method, options.seeds, options.rounds)
-    one, two = ([turn["chunk_s"] + turn["gather_s"] for turn in found[name]] for name in PAIR)
+    measured = measure(options.method, options.seeds, options.rounds)
+    one, two = ([turn["chunk_s"] + turn["gather_s"] for turn in measured[name]] for name in PAIR)
     ratios = sorted(a / b for a, b in zip(one, two, strict=True))
     median = statistics.median(ratios)
     print(f"Two processes have {median:.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f}) times the rate")
-    for name, turns in found.items():
+    for name, turns in measured.items():
         seconds = {key: f"{value:.4g}" for key, value in medians(turns).items()}
         print(f"{name}: {seconds}")
     if options.json is not None:
@@ -75,8 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "method": options.method,
             "seeds": options.seeds,
             "two_processes_rate_over_one": [median, ratios[0], ratios[-1]],
-            "medians": {name: medians(turns) for name, turns in found.items()},
-            "rounds": found,
+            "medians": {name: medians(turns) for name, turns in measured.items()},
+            "rounds": measured,
         }
         measuring.write(result, options.json)
     return 0
@@ -94,11 +94,11 @@ def measure(method: str, seeds_count: int, rounds: int) -> dict[str, list[dict[s
         job |= {"coordinator": f"127.0.0.1:{port}", "processes": processes}
         started[name] = [start(job | {"index": index}) for index in range(processes)]
     try:
-        found = [{name: turn(workers) for name, workers in started.items()} for _ in range(rounds)]
+        turns = [{name: turn(workers) for name, workers in started.items()} for _ in range(rounds)]
     finally:
         for worker in (worker for workers in started.values() for worker in workers):
             worker.kill()
-    return {name: [turns[name] for turns in found] for name in started}
+    return {name: [of[name] for of in turns] for name in started}
 
 
 def start(job: dict[str, Any]) -> subprocess.Popen:

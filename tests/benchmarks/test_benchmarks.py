@@ -320,7 +320,7 @@ def fake_training(monkeypatch):
             if checkpointer is not None:
                 checkpointer.save_if_due(step, lambda: ({"weight": weight}, {"step": np.ones(1)}))
 
-    monkeypatch.setattr(checkpoint_cost.cells, "train", train)
+    monkeypatch.setattr(checkpoint_cost.cell_lib, "train", train)
 
 
 def test_checkpoints_are_counted_and_their_cost_is_of_the_time_without(fake_training):

@@ -12,8 +12,7 @@ from polars.testing import assert_frame_equal
 
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import checkpoint
-from cmedirl_jax.runs import load_policy, load_reward, start, validation
-from cmedirl_jax.runs import run as run_lib
+from cmedirl_jax.runs import load_policy, load_reward, start, train, validation
 from cmedirl_jax.runs.cells import experts
 from cmedirl_jax.runs.cluster.base import ALONE
 from cmedirl_jax.runs.errors import UserError
@@ -425,7 +424,7 @@ def test_a_finished_run_is_left_alone(smoke, main, monkeypatch, capsys):
     folder, done = smoke
     before = snapshot(folder)
     times = {path: path.stat().st_mtime_ns for path in before if path.name != ".lock"}
-    monkeypatch.setattr(run_lib, "_train_cells", lambda *_: pytest.fail("it trains again"))
+    monkeypatch.setattr(train, "train_cells", lambda *_: pytest.fail("it trains again"))
     assert main(*SMOKE, "--out", folder) == 0
     assert snapshot(folder) == before
     assert {path: path.stat().st_mtime_ns for path in times} == times
@@ -434,7 +433,7 @@ def test_a_finished_run_is_left_alone(smoke, main, monkeypatch, capsys):
 
 def test_fewer_cells_are_shown_without_training_and_all_again(smoke, main, monkeypatch, tmp_path):
     folder = shutil.copytree(smoke[0], tmp_path / "run")
-    monkeypatch.setattr(run_lib, "_train_cells", lambda *_: pytest.fail("it trains again"))
+    monkeypatch.setattr(train, "train_cells", lambda *_: pytest.fail("it trains again"))
     assert main(*SMOKE, "--methods", "me-ddpg", "ddpg", "--seeds", 3, "--out", folder) == 0
     table = pl.read_parquet(folder / "seeds.parquet")
     assert table.select("method", "seed").rows() == [

@@ -7,6 +7,7 @@ import pytest
 
 from cmedirl_jax import networks
 from cmedirl_jax.agents import hot_start
+from cmedirl_jax.irl.rewards import RewardNetworkSettings
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs import load_policy, load_reward
 from cmedirl_jax.runs.storage import cells, plain, sealing
@@ -14,7 +15,8 @@ from cmedirl_jax.runs.storage.cells import CellKey
 from cmedirl_jax.tabular import discretise, imitation, interpolation
 from cmedirl_jax.tabular.imitation import TabularSettings
 from cmedirl_jax.training import compose
-from cmedirl_jax.training.methods import METHODS, RewardNetworkSettings, Settings
+from cmedirl_jax.training.methods import METHODS
+from cmedirl_jax.training.settings import Settings
 from tests.support import cells as cells_of
 from tests.support import pools, trainers
 

@@ -53,7 +53,7 @@ def compile_networks(
 
     Apart from `compile_method`: drawing them takes most of the time that an `init` compiles.
     """
-    trainer = training.make(env, METHODS["ddpg"], Settings(architecture), capacity=1)
+    trainer = training.make(env, METHODS["ddpg"], Settings(architecture=architecture), capacity=1)
     drawn = seeds.step_groups(lambda key: (key, trainer.draw_networks(key)), group)
 
     def draw(keys: jax.Array, groups: int) -> Any:

@@ -11,7 +11,7 @@ from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.runs.cells import cell as cell_lib
-from cmedirl_jax.runs.cells.cell import Progress
+from cmedirl_jax.runs.cells.cell import CellResult, Progress
 from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.cluster.base import ALONE, Cluster
@@ -65,10 +65,7 @@ def make_pool(
         checkpointer=checkpointer,
     )
     # Choose who demonstrates, by the final policies' returns.
-    final = result.evaluations[-1]
-    returns = np.where(result.diverged, -np.inf, 0.0)
-    alive = ~result.diverged[final.seed]
-    returns[final.seed[alive]] = np.asarray(final.evaluation.return_mean)[alive]
+    returns = _final_returns(result)
     chosen = choose(returns, which, threshold)
     if not chosen.size:
         raise UserError(
@@ -76,15 +73,6 @@ def make_pool(
             f"{options.steps} steps; give them more steps (--experts.steps) or seeds, "
             "and the run another folder"
         )
-    # Record.
-    actors = jax.tree.map(lambda leaf: jnp.asarray(leaf[chosen]), result.final)
-    per_expert = -(-options.trajectories // chosen.size)
-
-    @jax.jit
-    @jax.vmap
-    def record_all(actor: Any, key: jax.Array) -> tuple[Transition, jax.Array, jax.Array]:
-        return record(programs.evaluator.act, env, actor, key, per_expert)
-
     metadata = {
         "env": env.spec.id,
         "source": "noise-free trajectories of DDPG experts trained on the true reward",
@@ -95,15 +83,30 @@ def make_pool(
         "expert_env_steps": int(result.env_steps.sum()),
     }
 
+    # Record, on one process for all: rounding on another machine might give other episodes.
+    per_expert = -(-options.trajectories // chosen.size)
+    record_all = jax.jit(
+        jax.vmap(lambda actor, key: record(programs.evaluator.act, env, actor, key, per_expert))
+    )
+
     def recorded() -> Demonstrations:
+        actors = jax.tree.map(lambda leaf: jnp.asarray(leaf[chosen]), result.final)
         columns = record_all(actors, jax.random.split(start_key, chosen.size))
         transition, running, truncated = jax.tree.map(np.asarray, columns)
         return flatten(transition, running, truncated, metadata)
 
-    # On one process for all: rounding on another machine might give episodes of other lengths.
     pool = cluster.pool_from_writer(recorded)
     assert pool is not None
     return pool
+
+
+def _final_returns(result: CellResult) -> np.ndarray:
+    """The return of each expert's final policy, `[experts]`; -inf for one that diverged."""
+    final = result.evaluations[-1]
+    returns = np.where(result.diverged, -np.inf, 0.0)
+    alive = ~result.diverged[final.seed]
+    returns[final.seed[alive]] = np.asarray(final.evaluation.return_mean)[alive]
+    return returns
 
 
 def choose(returns: np.ndarray, which: Expert, threshold: float) -> np.ndarray:

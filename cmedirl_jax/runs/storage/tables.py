@@ -144,7 +144,7 @@ def read(folder: Path, config: dict[str, Any]) -> dict[str, pl.DataFrame]:
     """
     try:
         asked = cells.asked(config["methods"], config["n_demos"])
-    except (LookupError, TypeError) as error:
+    except (LookupError, TypeError, ValueError) as error:
         raise UserError(f"{folder}: its config.json names no cells ({error!r})") from error
     run_tables = of_cells(cells.finished(folder), asked, config["seeds"])
     if not run_tables:

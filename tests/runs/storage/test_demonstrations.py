@@ -32,7 +32,6 @@ def test_a_run_that_keeps_none_yet_has_none(tmp_path):
 
 def test_another_valid_pool_in_its_place_is_refused(folder):
     demonstrations.save(folder / "pool.npz", pools.scripted(4))
-    with pytest.raises(UserError, match=r"^--out: .*demonstrations is damaged \(pool\.npz\)"):
     with pytest.raises(UserError, match=r"^.*demonstrations is damaged \(pool\.npz\)"):
         stored_demonstrations.load(folder.parent, SPEC)
 
