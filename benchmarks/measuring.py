@@ -39,7 +39,7 @@ class Record:
     platform: str
 
     def fields(self) -> dict[str, Any]:
-        """As the JSON has it; seeds per second are those of a main job of `CAPACITY` steps."""
+        """The record as JSON values; seeds per second are for a main job of `CAPACITY` steps."""
         median = statistics.median(self.rates)
         workload = dataclasses.asdict(self.workload)
         width = workload.pop("hidden")
@@ -179,5 +179,5 @@ def machine() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of the packages that the numbers depend on."""
+    """The versions of the packages that the numbers depend on."""
     return {name: importlib.metadata.version(name) for name in PACKAGES}

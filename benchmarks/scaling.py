@@ -122,7 +122,7 @@ def turn(workers: list[subprocess.Popen]) -> dict[str, float]:
 
 
 def medians(turns: list[dict[str, float]]) -> dict[str, float]:
-    """Of every quantity."""
+    """The median of every quantity over the turns."""
     return {name: statistics.median(turn[name] for turn in turns) for name in turns[0]}
 
 

@@ -34,7 +34,7 @@ class Options:
 
 
 class Sample(NamedTuple):
-    """What the process held at a moment."""
+    """The process's resources at a moment."""
 
     seconds: float
     cells: int
@@ -102,7 +102,7 @@ def growth_per_cell(samples: Sequence[Sample]) -> float:
 
 
 def least_per_cell(samples: Sequence[Sample]) -> list[Sample]:
-    """Of each number of finished cells the least that was held: not what one needs for a while."""
+    """The least resources at each number of finished cells: without what a cell needs meanwhile."""
     by_cell: dict[int, list[Sample]] = {}
     for sample in samples:
         by_cell.setdefault(sample.cells, []).append(sample)

@@ -1,4 +1,4 @@
-"""What a user can ask of a run."""
+"""The configuration of a run, as the command line and presets give it."""
 
 import dataclasses
 import os

@@ -26,7 +26,7 @@ from cmedirl_jax.types import EnvSpec
 
 
 class _Learned(NamedTuple):
-    """What a cell's policies and rewards are of."""
+    """A cell, and the task, method and settings of its policies and rewards."""
 
     cell: SavedCell
     task: EnvSpec

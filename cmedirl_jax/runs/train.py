@@ -58,7 +58,7 @@ class Cell(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What the progress calls it."""
+        """Its name in the progress."""
         seeds = f"{len(self.block)} seeds"
         if self.block.start:
             seeds = f"seeds {self.block.start} to {self.block.stop - 1}"
@@ -78,7 +78,7 @@ class _Pool(NamedTuple):
 
 
 class Session(NamedTuple):
-    """What a run is given once and its parts share."""
+    """The plan and the means of a run, which its cells share."""
 
     plan: Plan
     keys: Keys
@@ -108,7 +108,7 @@ def session_of(
     interruption: Interruption,
     cluster: Cluster,
 ) -> Session:
-    """What the cells of a run share: keys, and programs that are compiled at their first use."""
+    """The session of a run; its programs are compiled at their first use."""
     return Session(
         plan,
         Keys(*jax.random.split(jax.random.key(plan.study), 3)),

@@ -25,7 +25,7 @@ from cmedirl_jax.training.settings import Settings
 
 
 class Plan(NamedTuple):
-    """What a run does, from a configuration that is known to work.
+    """The work of a run, from a configuration that has been checked.
 
     Attributes:
         folder: where its results go.

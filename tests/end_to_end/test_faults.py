@@ -222,6 +222,21 @@ def test_a_signal_ends_a_run_with_its_code_and_a_line(runs, whole, tmp_path):
     assert_same_run(run, whole)
 
 
+def test_a_cell_that_another_command_does_not_ask_for_keeps_its_checkpoint(runs, whole, tmp_path):
+    """The command for fewer cells is finished in between, and shows its own."""
+    run = tmp_path / "run"
+    process = runs.start(run)
+    wait_for(process, lambda: progress(run) >= STEPS + 500)
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=LIMIT)
+    assert "[1/1]" not in runs.finish(run, "--n-demos", "1", "--seeds", "3")
+    assert pl.read_parquet(run / "seeds.parquet").select("n_demos", "seed").rows() == [
+        (1, seed) for seed in range(3)
+    ]
+    assert "hs-me-ddpg-n2-seeds-0-3 goes on from its checkpoint" in runs.finish(run)
+    assert_same_run(run, whole)
+
+
 def test_a_run_needs_no_reader(runs, whole, tmp_path):
     """As `| tee log` where a signal ends `tee` too, and then `> /dev/full`."""
     run = tmp_path / "run"

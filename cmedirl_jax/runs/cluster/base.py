@@ -1,4 +1,4 @@
-"""What a run asks of the processes that share it, and the answers of a run that has only one."""
+"""The processes that share a run: their interface, and its form for a single process."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol

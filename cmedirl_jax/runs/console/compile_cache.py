@@ -17,7 +17,7 @@ _HIT, _MISS = "/jax/compilation_cache/cache_hits", "/jax/compilation_cache/cache
 
 @dataclasses.dataclass
 class Cost:
-    """What compiling has cost.
+    """The cost of compiling so far.
 
     Attributes:
         seconds: for tracing, lowering, compiling and reading the cache. A function traced within

@@ -197,7 +197,7 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of the packages that a run's numbers depend on."""
+    """The versions of the packages that a run's numbers depend on."""
     return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 

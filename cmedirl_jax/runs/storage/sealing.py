@@ -16,10 +16,10 @@ from typing import Any
 from cmedirl_jax.io import atomic
 
 SCHEMA = 3
-"""Of everything that a run writes. Schema 1 were runs with `tables.json`."""
+"""The version of a run's files. Runs of schema 1 had a `tables.json`."""
 SEAL = "seal.json"
 _NOT_AS_WRITTEN = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
-"""What the system raises where files are missing; other errors may pass."""
+"""Errors that mean a missing file; after other errors the file may still be whole."""
 
 
 class Damaged(Exception):
