@@ -11,6 +11,7 @@ import numpy as np
 
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.runs.cluster import orbax_worker
+from cmedirl_jax.runs.cluster.base import Cluster
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.training import seeds as seeds_lib
 from cmedirl_jax.types import Transition
@@ -19,8 +20,8 @@ _BLOCK, _PIECE = 2**12, 2**26
 """Bytes are sent in pieces, the last in whole blocks, so that few sizes are compiled."""
 
 
-class Together:
-    """See `base.Cluster`. Needs `jax.distributed`."""
+class Together(Cluster):
+    """Several processes, which have joined `jax.distributed`."""
 
     @property
     def writer(self) -> bool:
@@ -28,11 +29,7 @@ class Together:
         return jax.process_index() == 0
 
     def check_same(self, options: dict[str, Any]) -> None:
-        """Check that every process was started with the same options.
-
-        Raises:
-            UserError: on every process, if one was not.
-        """
+        """See `Cluster.check_same`."""
         mine = json.loads(json.dumps(options))
         writers = self.from_writer(lambda: mine)
         other = [name for name in mine if mine[name] != writers[name]]
@@ -41,12 +38,7 @@ class Together:
             raise UserError(f"--process-id: not all processes were given the same options ({here})")
 
     def devices(self, count: int | None, seeds: int) -> list[Any]:
-        """The devices of all processes, those of one process side by side, connected.
-
-        Args:
-            count: devices of each process, or None for all that get four seeds or more.
-            seeds: how many seeds share them.
-        """
+        """Those of one process side by side, connected; by default four seeds or more for each."""
         if count is None:
             count = max(1, seeds // (4 * jax.process_count()))
         every = range(jax.process_count())
@@ -76,11 +68,7 @@ class Together:
         return jax.tree.unflatten(structure, [np.asarray(leaf) for leaf in leaves])
 
     def from_writer(self, read: Callable[[], Any]) -> Any:
-        """The JSON value that `read` returns on process 0.
-
-        Raises:
-            UserError: on every process, if `read` raised it.
-        """
+        """See `Cluster.from_writer`."""
         message, error = {}, None
         if self.writer:
             try:
