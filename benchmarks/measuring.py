@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmarks.serving import Worker
 from benchmarks.workload import CAPACITY, Workload
-from experiments.run_grid import cores
+from cmedirl_jax.runs.start import cores
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
 

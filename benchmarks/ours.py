@@ -1,6 +1,7 @@
 """The library's training loop, as `experiments.run_grid` runs it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +75,7 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
 def compile_programs(
     method: str,
     settings: Settings,
-    devices: list[jax.Device],
+    devices: Sequence[Any],
     *,
     seeds_count: int,
     group: int | None = None,

@@ -25,7 +25,8 @@ from benchmarks import measuring, ours
 from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells.slots import Slots
-from cmedirl_jax.runs.cluster import exchange
+from cmedirl_jax.runs.cluster.base import ALONE, Cluster
+from cmedirl_jax.runs.cluster.together import Together
 from cmedirl_jax.training import seeds
 from cmedirl_jax.training.settings import Settings
 
@@ -133,10 +134,11 @@ def work(
 ) -> None:
     """Train a chunk whenever a line comes, and print how long that took, as JSON."""
     jax.config.update("jax_num_cpu_devices", devices)
+    cluster: Cluster = ALONE
     if processes > 1:
         jax.distributed.initialize(coordinator, processes, index)
-    spread_over = exchange.devices(devices, seeds_count)
-    exchange.connect(spread_over)
+        cluster = Together()
+    spread_over = cluster.devices(devices, seeds_count)
 
     # The seeds as a run of many seeds has them.
     programs = ours.compile_programs(method, Settings(), spread_over, seeds_count=seeds_count)
@@ -156,12 +158,12 @@ def work(
         before = time.perf_counter()
         state, log = jax.block_until_ready(programs.run(state, groups, None, steps, None))
         times["chunk_s"] = time.perf_counter() - before
-        timed(times, "gather", log)
+        timed(cluster, times, "gather", log)
         times["gather_bytes"] = sum(leaf.nbytes for leaf in jax.tree.leaves(log))
         for array in extra:
-            timed(times, f"gather_{array.nbytes}_bytes", array)
+            timed(cluster, times, f"gather_{array.nbytes}_bytes", array)
         before = time.perf_counter()
-        exchange.any_process(False)
+        cluster.any(False)
         times["flag_s"] = time.perf_counter() - before
         return state, times
 
@@ -175,10 +177,10 @@ def work(
         print(json.dumps(times), flush=True)
 
 
-def timed(times: dict[str, float], name: str, tree: Any) -> None:
+def timed(cluster: Cluster, times: dict[str, float], name: str, tree: Any) -> None:
     """Gather a tree, and note the seconds as `times[name + "_s"]`."""
     before = time.perf_counter()
-    exchange.gather(tree)
+    cluster.gather(tree)
     times[f"{name}_s"] = time.perf_counter() - before
 
 

@@ -89,7 +89,7 @@ def watch(options: Options, run: Path) -> tuple[int, list[Sample]]:
             with watched.oneshot():
                 sample = Sample(
                     time.monotonic() - began,
-                    len(list(run.glob("rewards/*[0-9]"))),
+                    len(list(run.glob("cells/[!.]*"))),
                     watched.memory_info().rss,
                     watched.num_fds(),
                     watched.num_threads(),

@@ -1,13 +1,12 @@
 """`python -m experiments.compare FOLDER`: each cell of a run against one of them, seed by seed.
 
-Seeds are paired: seed i of every method draws the same networks, starts and noise. So the
-differences are of pairs, their intervals bootstrapped over pairs, their p-values from flipping
-the signs of pairs, adjusted for the number of cells by Holm's method.
+Seeds are paired: seed i of every method draws the same networks, starts and noise. Differences are
+therefore taken within pairs. Intervals are bootstrapped over pairs; p-values come from flipping the
+signs of pairs, and are adjusted for the number of cells by Holm's method.
 """
 
 import contextlib
 import dataclasses
-import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -25,14 +24,15 @@ from cmedirl_jax import envs
 from cmedirl_jax.runs import statistics
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.statistics import SeedStatistics
-from cmedirl_jax.runs.storage import sealing
+from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.runs.storage import sealing, tables
 
 MEASURES: dict[str, Callable[[SeedStatistics, int], np.ndarray]] = {
     "convergence_env_step": lambda seeds, most: np.minimum(seeds.convergence_env_step, most),
     "area": lambda seeds, most: seeds.area,
     "final_return": lambda seeds, most: seeds.final_return,
 }
-"""What is compared; a seed that never converged counts as having done so at the last step."""
+"""The measures compared. A seed that never converged counts as converged at the last step."""
 
 RESAMPLES = 9_999
 
@@ -77,10 +77,8 @@ def compare(folder: Path, against: str) -> pl.DataFrame:
         UserError: if the folder holds no run, a damaged one, one whose cells end at different
             steps, a single seed, no cell of that method, or none to compare with it.
     """
-    if not all((folder / name).exists() for name in ("config.json", "evaluations.parquet")):
-        raise UserError(f"{folder}: holds no finished cell of a run")
+    config = run_folder.read(folder)["config"]
     with _undamaged(folder):
-        config = json.loads((folder / "config.json").read_text())["config"]
         episodes, seeds_count = config["max_episodes"], int(config["seeds"])
     if episodes is not None:
         raise UserError(f"{folder}: a run over episodes, whose seeds end at different steps")
@@ -88,25 +86,17 @@ def compare(folder: Path, against: str) -> pl.DataFrame:
         raise UserError(f"{folder}: one seed has no interval")
     with _undamaged(folder):
         most, threshold = int(config["max_steps"]), envs.make(config["env"]).spec.reward_threshold
-        cells = _seed_statistics(folder, threshold)
+        cells = _seed_statistics(tables.read(folder, config), threshold)
         for (method, _), seeds in cells.items():
             if seeds.area.size != seeds_count or not np.isfinite(seeds.area).all():
-                raise ValueError(f"{method} has no finite returns of {seeds_count} seeds")
-    references = {n_demos: seeds for (method, n_demos), seeds in cells.items() if method == against}
-    if not references:
-        methods = ", ".join(sorted({method for method, _ in cells}))
-        raise UserError(f"--against: {folder} holds no {against!r}; its methods are {methods}")
-    pairs = {}
-    for (method, n_demos), seeds in cells.items():
-        only = next(iter(references.values())) if len(references) == 1 else None
-        reference = references.get(n_demos, only)
-        if method != against and reference is not None:
-            pairs[method, n_demos] = seeds, reference
-    if not pairs:
-        raise UserError(f"{folder}: holds no method beside {against} to compare with it")
+                raise UserError(
+                    f"{folder}: {method} has no finite returns of {seeds_count} seeds; finish the "
+                    "run first"
+                )
+    pairs = _pairs(folder, cells, against)
     rows = []
     for name, measure in MEASURES.items():
-        found = [
+        differences = [
             {
                 "method": method,
                 "n_demos": n_demos,
@@ -115,19 +105,40 @@ def compare(folder: Path, against: str) -> pl.DataFrame:
             }
             for (method, n_demos), (seeds, reference) in pairs.items()
         ]
-        adjusted = holm(np.array([row["p_value"] for row in found]))
-        rows += [row | {"p_holm": p} for row, p in zip(found, adjusted, strict=True)]
+        adjusted = holm(np.array([row["p_value"] for row in differences]))
+        rows += [row | {"p_holm": p} for row, p in zip(differences, adjusted, strict=True)]
     return pl.DataFrame(rows)
+
+
+def _pairs(
+    folder: Path, cells: dict[tuple[str, int], SeedStatistics], against: str
+) -> dict[tuple[str, int], tuple[SeedStatistics, SeedStatistics]]:
+    """Each cell of another method, and the cell of the method `against` that it is compared with.
+
+    Raises:
+        UserError: if there is no cell of that method, or none to compare with it.
+    """
+    references = {n_demos: seeds for (method, n_demos), seeds in cells.items() if method == against}
+    if not references:
+        methods = ", ".join(sorted({method for method, _ in cells}))
+        raise UserError(f"--against: {folder} holds no {against!r}; its methods are {methods}")
+    only = next(iter(references.values())) if len(references) == 1 else None
+    pairs = {}
+    for (method, n_demos), seeds in cells.items():
+        reference = references.get(n_demos, only)
+        if method != against and reference is not None:
+            pairs[method, n_demos] = seeds, reference
+    if not pairs:
+        raise UserError(f"{folder}: holds no method beside {against} to compare with it")
+    return pairs
 
 
 @contextlib.contextmanager
 def _undamaged(folder: Path) -> Iterator[None]:
-    """Turn whatever json, polars or numpy stumble over in a damaged file into a user's error."""
+    """Turn any error about a configuration's values into a user's error."""
     try:
         yield
-    except UserError:
-        raise
-    except (Exception, pl.exceptions.PanicException) as error:
+    except (LookupError, TypeError, ValueError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise UserError(f"{folder}: holds a damaged file ({reason})") from error
 
@@ -141,19 +152,21 @@ def holm(p_values: np.ndarray) -> np.ndarray:
     return adjusted
 
 
-def _seed_statistics(folder: Path, threshold: float) -> dict[tuple[str, int], SeedStatistics]:
-    """Of every cell whose method acts, its seeds' statistics."""
-    tables = sealing.read(folder)
+def _seed_statistics(
+    run_tables: dict[str, pl.DataFrame], threshold: float
+) -> dict[tuple[str, int], SeedStatistics]:
+    """The statistics of the seeds of every cell whose method acts."""
     by_cell = ["method", "n_demos"]
     diverged = {
-        key: group.sort("seed")["diverged"].to_numpy()
-        for key, group in tables["seeds"].group_by(by_cell)
+        cell: rows.sort("seed")["diverged"].to_numpy()
+        for cell, rows in run_tables["seeds"].partition_by(by_cell, as_dict=True).items()
     }
-    found = {}
-    for key, group in tables["evaluations"].group_by(by_cell, maintain_order=True):
-        if group["env_step"].max() != 0:
-            found[key] = statistics.of_seeds(group, diverged[key], threshold)
-    return found
+    evaluations = run_tables["evaluations"].partition_by(by_cell, as_dict=True)
+    return {
+        (method, n_demos): statistics.of_seeds(rows, diverged[method, n_demos], threshold)
+        for (method, n_demos), rows in evaluations.items()
+        if rows["env_step"].max() != 0
+    }
 
 
 def _paired(values: np.ndarray, reference: np.ndarray) -> dict[str, Any]:
@@ -186,10 +199,10 @@ def shown(table: pl.DataFrame, against: str) -> Table:
         printed.add_column("p (Holm)", justify="right")
     for (method, n_demos), group in table.group_by("method", "n_demos", maintain_order=True):
         row = []
-        for found in group.iter_rows(named=True):
-            form = "{:+,.0f}" if found["measure"] == "convergence_env_step" else "{:+.1f}"
-            numbers = (found[f"difference{end}"] for end in ("", "_low", "_high"))
-            row += ["{} [{}, {}]".format(*map(form.format, numbers)), f"{found['p_holm']:.4f}"]
+        for paired in group.iter_rows(named=True):
+            form = "{:+,.0f}" if paired["measure"] == "convergence_env_step" else "{:+.1f}"
+            numbers = (paired[f"difference{end}"] for end in ("", "_low", "_high"))
+            row += ["{} [{}, {}]".format(*map(form.format, numbers)), f"{paired['p_holm']:.4f}"]
         printed.add_row(str(method), str(n_demos) if n_demos else "-", *row)
     return printed
 

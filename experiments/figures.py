@@ -1,7 +1,8 @@
-"""The paper's Figures 3, 4 and 5, from the tables of a run."""
+"""The paper's Figures 3, 4 and 5, drawn from the tables of a run."""
 
 import itertools
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -65,7 +66,8 @@ def average_return(
         _band(left, rows, "env_step", "return_mean", method, line)
         rows = episodes.filter(pl.col("method") == method)
         if rows.height:
-            # Where the first seed runs out of episodes the seeds left are no longer the same ones.
+            # The curve ends where the first seed runs out of episodes: a mean over the seeds that
+            # are left would be over other seeds.
             last = rows.group_by("seed").agg(pl.col("episode").max())
             seeds = evaluations.filter(pl.col("method") == method)["seed"].n_unique()
             shortest = last["episode"].min() if last.height == seeds else 0
@@ -141,7 +143,7 @@ def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None
             continue
         at = positions[np.isin(numbers, rows["n_demos"].to_numpy())]
         offset = 0.06 * (index - (len(lines) - 1) / 2)
-        # What was never reached is left out; an arrow stands for an interval without upper bound.
+        # A median that was never reached is left out; an arrow means an unbounded interval.
         unbounded = np.isnan(high) & ~np.isnan(middle)
         bars = np.array([middle - low, np.where(np.isnan(high), 0.0, high - middle)])
         axes.plot(
@@ -161,7 +163,7 @@ def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None
 
 
 def _band(
-    axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, line: dict[str, str]
+    axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, line: dict[str, Any]
 ) -> None:
     points = rows.group_by(x, maintain_order=True).agg(pl.col(y)).sort(x)
     seeds = rows["seed"].n_unique()
@@ -171,8 +173,8 @@ def _band(
         return
     label = METHODS[method].label or method
     if len(intervals) == 1:
-        # Of a method that never interacts: the same at every step.
-        axes.axhline(intervals[0, 0], **line | {"linestyle": "-."}, label=label)
+        # A method that never interacts has the same return at every step.
+        axes.axhline(intervals[0, 0], color=line["color"], linestyle="-.", label=label)
         return
     axes.plot(points[x], intervals[:, 0], **line, label=label)
     axes.fill_between(
@@ -187,7 +189,7 @@ def _legend(figure: Figure, axes: Axes) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
 
 
-def _lines(table: pl.DataFrame) -> dict[str, dict[str, str]]:
+def _lines(table: pl.DataFrame) -> dict[str, dict[str, Any]]:
     """Each method's line: a colour of its own, dashed once the palette is used up."""
     methods = table["method"].unique(maintain_order=True)
     styles = itertools.product(("-", "--", ":"), COLOURS)

@@ -1,8 +1,8 @@
-"""`python -m experiments.optimal_return`: what no policy can exceed, from each start.
+"""`python -m experiments.optimal_return`: the best return that any policy can have, by start state.
 
-Value iteration of the environment's own reward on ever finer grids: V* undiscounted with the
-environment's time limit, and at the agent's discount without one. Beside each value stands what the
-policy that looks one step ahead by it really earns in the continuous task: that much is attainable.
+Value iteration on ever finer grids gives V* of the environment's own reward: undiscounted with the
+time limit, and at the agent's discount without one. V* on a grid is an approximation, so each row
+also has the return that a policy looking one step ahead by it attains in the continuous task.
 """
 
 import dataclasses
@@ -20,21 +20,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from cmedirl_jax import envs
+from cmedirl_jax import envs, ranges
 from cmedirl_jax.envs import Env
+from cmedirl_jax.ranges import AtLeastTwo, BelowOne, Size
 from cmedirl_jax.runs.console import compile_cache
 from cmedirl_jax.tabular import discretise, interpolation
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.tabular.optimal_control import value_iteration
-from cmedirl_jax.training import ranges
-
-RANGES = {
-    "states": ranges.TWO_OR_MORE,
-    "actions": ranges.TWO_OR_MORE,
-    "discount": ranges.BELOW_ONE,
-    "starts": ranges.SIZE,
-}
-"""Of every number in `Options`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,16 +37,16 @@ class Options:
         env: The environment, by Gymnasium's name.
         states: Points along each dimension of the observation, a grid for each.
         actions: Points along each dimension of the action.
-        discount: The agent's; the undiscounted optimum is found beside it.
+        discount: The agent's; the undiscounted optimum is computed too.
         starts: Start states, evenly spaced, as in the evaluations of `tuned`.
         out: A CSV file for the table of all starts.
     """
 
     env: str = "MountainCarContinuous-v0"
-    states: tuple[int, ...] = (101, 201, 401)
-    actions: int = 21
-    discount: float = 0.99
-    starts: int = 10
+    states: tuple[AtLeastTwo, ...] = (101, 201, 401)
+    actions: AtLeastTwo = 21
+    discount: BelowOne = 0.99
+    starts: Size = 10
     out: Path | None = None
 
 
@@ -86,14 +78,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def optimal_returns(options: Options) -> pl.DataFrame:
     """A row for each grid, discount and start.
 
-    `value` is V* by the table, `attained` what its policy earns in the same (discounted) sense, and
-    `attained_return` what that is undiscounted.
+    `value` is V* on the grid; `attained` the discounted, `attained_return` the undiscounted return
+    of the policy that looks one step ahead by it.
 
     Raises:
         ValueError: for an unknown environment, one that cannot be discretised, or a number out of
             its range.
     """
-    for name, wrong in ranges.out_of_range(options, RANGES):
+    for name, wrong in ranges.out_of_range(options):
         raise ValueError(f"--{name}: {wrong}")
     env = envs.make(options.env)
     spec, params = env.spec, env.default_params
@@ -123,7 +115,7 @@ def optimal_returns(options: Options) -> pl.DataFrame:
 def _solve(
     mdp: FiniteMDP, first: jax.Array, discount: float, *, env: Env, horizon: int | None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """V* at the start states, and what looking one step ahead by V* earns from them."""
+    """V* at the start states, and the two returns of the policy that looks one step ahead by it."""
     best = value_iteration(
         mdp.dynamics, mdp.reward, discount=discount, horizon=horizon, absorbing=mdp.absorbing
     )
@@ -132,6 +124,7 @@ def _solve(
     assert env.state_at is not None
     state_at = env.state_at
 
+    # The value of an action: its reward, and V* where it leads.
     def ahead(values: jax.Array, observation: jax.Array, action: jax.Array) -> jax.Array:
         step = env.step(jax.random.key(0), state_at(observation, params), action, params)[1]
         later = jnp.where(step.terminated, 0.0, discretise.look_up(mdp, values, step.observation))
@@ -139,16 +132,19 @@ def _solve(
 
     def advance(carry, time: jax.Array):
         states, observation, done, earned, total = carry
+        # V* of the steps that remain.
         values = best.values
         if horizon is not None:
             following = values[jnp.minimum(time + 1, horizon - 1)]
             values = jnp.where(time + 1 < horizon, following, 0.0)
+        # Take the action of the grid that is worth most.
         over_actions = jax.vmap(ahead, in_axes=(None, None, 0))
         worth = jax.vmap(over_actions, in_axes=(None, 0, None))(values, observation, actions)
         action = actions[jnp.argmax(worth, axis=-1)]
         states, step = jax.vmap(env.step, in_axes=(None, 0, 0, None))(
             jax.random.key(0), states, action, params
         )
+        # Count its reward while the episode runs.
         reward = jnp.where(done, 0.0, step.reward)
         done = done | step.terminated | step.truncated
         earned = earned + discount**time * reward

@@ -1,32 +1,30 @@
-"""`python -m experiments.run_grid`: train the grid, print the summary, draw the figures."""
+"""`python -m experiments.run_grid`: train the study, print its summary, draw its figures."""
 
 import argparse
-import contextlib
-import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-import jax
 import polars as pl
 import tyro
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from cmedirl_jax.envs import Env
-from cmedirl_jax.runs import heap
 from cmedirl_jax.runs import run as run_lib
-from cmedirl_jax.runs.cluster import exchange, processes
+from cmedirl_jax.runs import start, validation
+from cmedirl_jax.runs.cluster import processes
 from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.console import compile_cache, signals, streams
-from cmedirl_jax.runs.console.signals import Interrupted
-from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.validation import Cell
+from cmedirl_jax.runs.errors import Interrupted, UserError
+from cmedirl_jax.runs.storage import plain
 from experiments.presets import PRESETS
 
 _STOPPING = "Stopping after this chunk of steps; once more to stop at once\n"
 _CONTINUE = "start the same command again to go on"
+_OF_A_PROCESS = ("out", "coordinator", "process_id")
+"""The options in which the processes of one run may differ."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -40,10 +38,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str]) -> int:
     config = parse(arguments)
     try:
-        processes.check(config)
+        processes.check(config.cluster)
     except UserError as error:
         return _end(2, str(error))
-    if not processes.is_asked(config):
+    if not config.cluster.several:
         return work(config)
     if not processes.is_worker():
         return processes.supervise("experiments.run_grid", arguments)
@@ -55,14 +53,14 @@ def work(config: StudyConfig) -> int:
     console = Console(file=streams.dispensable())
     if not console.is_terminal:
         console = Console(file=streams.dispensable(), width=120)
-    heap.share(arenas=cores())
     compile_cache.use_cache()
+    same = {k: v for k, v in plain.plain(config).items() if k not in _OF_A_PROCESS}
     try:
-        # Before anything else: the first array that JAX makes fixes the number of CPU devices.
-        devices = start_devices(config)
-        console.quiet = not exchange.is_writer()
-        with signals.noted(None if console.quiet else _STOPPING) as interruption:
-            summary = run_lib.run(config, devices, console, interruption, _conclude)
+        cluster, devices = start.start(config.cluster, config.devices, config.seeds, same)
+        console.quiet = not cluster.writer
+        with signals.noted(None if console.quiet else _STOPPING, cluster) as interruption:
+            plan = validation.plan(config, cluster)
+            summary = run_lib.run(plan, devices, console, interruption, _conclude, cluster)
     except UserError as error:
         return _end(2, str(error))
     except Interrupted as error:
@@ -71,24 +69,25 @@ def work(config: StudyConfig) -> int:
         return _end(130, f"stopped at once; {_CONTINUE}")
     except OSError as error:
         return _end(1, f"{error}; what is finished is kept: {_CONTINUE}")
-    if summary is None:
-        return 0
+    if summary is not None:
+        _print(console, summary, plan.folder)
+    return 0
+
+
+def _print(console: Console, summary: pl.DataFrame, folder: Path) -> None:
     console.print(summary_table(summary))
     difference = summary["gymnasium_difference_max"].max()
     console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
     if summary["diverged"].sum():
         console.print(f"Seeds that diverged and were stopped: {summary['diverged'].sum()}")
-    console.print(
-        f"Tables and figures: {config.folder}", markup=False, highlight=False, soft_wrap=True
-    )
-    return 0
+    console.print(f"Tables and figures: {folder}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _conclude(config: StudyConfig, env: Env, cells: list[Cell], redraw: bool) -> pl.DataFrame:
+def _conclude(folder: Path) -> pl.DataFrame:
     # Matplotlib and scipy take a second to import: a refusal does not wait for them.
-    from experiments import conclusion
+    from experiments import report
 
-    return conclusion.conclude(config, env, cells, redraw)
+    return report.report(folder)
 
 
 def _end(exit_code: int, line: str) -> int:
@@ -109,40 +108,6 @@ def parse(arguments: Sequence[str]) -> StudyConfig:
         default=PRESETS.get(preset.preset, PRESETS["tuned"]),
         args=list(arguments),
     )
-
-
-def start_devices(config: StudyConfig) -> list[jax.Device]:
-    """Start JAX with as many CPU devices as the run uses, or take the GPUs there are.
-
-    Raises:
-        UserError: if more devices are asked for than there are.
-    """
-    # A device wants a few seeds to itself: fewer than four a device do not fill a vector unit.
-    wanted = config.devices or max(1, min(cores(), config.seeds // 4))
-    if config.devices is None or 1 <= config.devices <= cores():
-        # Once JAX has started (a second call in one process) it keeps the devices it has.
-        with contextlib.suppress(RuntimeError):
-            jax.config.update("jax_num_cpu_devices", wanted)
-    if processes.is_asked(config):
-        processes.join(config)
-    devices = jax.local_devices()
-    available = len(devices) if devices[0].platform != "cpu" else cores()
-    refused = config.devices is not None and config.devices > available
-    # Together: a process that left alone would keep the others waiting.
-    if exchange.any_process(refused):
-        there = f"there are {available}" if refused else "another process has fewer"
-        raise UserError(f"--devices: {config.devices} asked, {there}")
-    if processes.is_asked(config):
-        exchange.check_same(config)
-        shared = exchange.devices(config.devices, config.seeds)
-        exchange.connect(shared)
-        return shared
-    return devices[: max(config.devices, 1)] if config.devices is not None else devices
-
-
-def cores() -> int:
-    """How many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def summary_table(summary: pl.DataFrame) -> Table:

@@ -1,4 +1,4 @@
-"""What a run is: methods, numbers of demonstrations, seeds, a learner's budget, settings."""
+"""The configuration of a run, as the command line and presets give it."""
 
 import dataclasses
 import os
@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from cmedirl_jax.ranges import Count, NotNegative, Range, Size
+from cmedirl_jax.runs.cluster.base import ClusterOptions
 from cmedirl_jax.training.methods import PAPER_METHODS
 from cmedirl_jax.training.settings import Settings
 
@@ -51,8 +52,8 @@ class StudyConfig:
         out: Folder of the results; default results/PRESET.
         expert: Who demonstrates: the best or median expert that solved the task, or all of them
             alike.
-        demos: A demonstrations file to learn from; no experts are trained, their options say
-            nothing.
+        demos: A demonstrations file to learn from; no experts are trained, and their options are
+            not read.
         env: The environment, by Gymnasium's name.
         devices: CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU.
             With several processes, of each of them.
@@ -96,5 +97,10 @@ class StudyConfig:
     def folder(self) -> Path:
         """Where the results go."""
         out = self.out if self.out is not None else Path("results") / self.preset
-        # Or making a/../b would make a.
+        # Normalised: making a/../b would also make a.
         return Path(os.path.normpath(out))
+
+    @property
+    def cluster(self) -> ClusterOptions:
+        """Which processes share the run."""
+        return ClusterOptions(self.distributed, self.coordinator, self.processes, self.process_id)

@@ -1,10 +1,10 @@
-"""From the tables of a run to one row per cell, with intervals.
+"""A cell's statistics over its seeds, from the run's tables.
 
 Every interval is a 95% one over seeds: Clopper-Pearson for shares, order statistics for medians, a
 percentile bootstrap for means. A seed that never reached the threshold counts as +infinity in a
-median; it is never dropped. A seed that diverged stands at the lowest return it ever had for every
-evaluation that it misses. The intervals speak of the learners' seeds alone: all of them learn from
-one pool of demonstrations, made by one set of experts.
+median; it is never dropped. A diverged seed takes its lowest return in every evaluation that it
+misses. The intervals hold for other seeds of the learners, not for other experts: all learners
+share one pool of demonstrations.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,8 @@ import numpy as np
 import polars as pl
 import scipy.stats
 
+LABELS = ("study", "expert", "method", "n_demos")
+"""The columns that say which cell a row belongs to."""
 CONFIDENCE = 0.95
 RESAMPLES = 2_000
 
@@ -35,34 +37,34 @@ class SeedCurve(NamedTuple):
 
 
 class SeedStatistics(NamedTuple):
-    """What a seed's curve comes to.
+    """Statistics of one seed's curve, numbers; or of many seeds, arrays `[seeds]`.
 
     Attributes:
-        convergence_env_step: of the first evaluation at the threshold; inf if there is none.
-        convergence_episode: likewise.
+        convergence_env_step: step of the first evaluation at the threshold; inf if there is none.
+        convergence_episode: episodes finished by then; inf if there is none.
         sustained: it converged, and every later evaluation is at the threshold too.
         dip_fraction: share of the evaluations after the first at the threshold that fall below it;
             NaN if it never converged or nothing came after.
         area: mean return over the evaluations, each counted alike.
-        final_return: of the last evaluation.
+        final_return: return at the last evaluation.
         return_after_convergence: mean return from convergence on; NaN if it never converged.
     """
 
-    convergence_env_step: float
-    convergence_episode: float
-    sustained: bool
-    dip_fraction: float
-    area: float
-    final_return: float
-    return_after_convergence: float
+    convergence_env_step: Any
+    convergence_episode: Any
+    sustained: Any
+    dip_fraction: Any
+    area: Any
+    final_return: Any
+    return_after_convergence: Any
 
 
 def seed_statistics(curve: SeedCurve, threshold: float, missing: int = 0) -> SeedStatistics:
-    """Reduce one seed's curve, of which the last `missing` evaluations were lost to divergence."""
+    """Statistics of one seed whose last `missing` evaluations were lost to divergence."""
     floor = np.full(missing, curve.return_mean.min())
     returns = np.concatenate([curve.return_mean, floor])
     reached = returns >= threshold
-    # Once diverged, a policy that always solved the task does so no more.
+    # A diverged seed no longer solves the task, whatever its lowest return was.
     reached[returns.size - missing :] = False
     area, final = float(returns.mean()), float(returns[-1])
     if not reached.any():
@@ -89,10 +91,10 @@ def share(successes: np.ndarray) -> Interval:
 
 def median(values: np.ndarray) -> Interval:
     """The lower median of `[seeds]` values, inf allowed, with its order-statistics interval."""
-    test = scipy.stats.quantile_test(values, q=0.0, p=0.5)
+    test = scipy.stats.quantile_test(values, q=0, p=0.5)
     interval = test.confidence_interval(CONFIDENCE)
     estimate = np.quantile(values, 0.5, method="lower")
-    # Too few values have no order statistic on one side; scipy says NaN, which means unbounded.
+    # With few values scipy finds no order statistic for a bound and returns NaN: unbounded.
     low = -np.inf if np.isnan(interval.low) else interval.low
     high = np.inf if np.isnan(interval.high) else interval.high
     return Interval(float(estimate), float(low), float(high))
@@ -147,13 +149,13 @@ def of_seeds(evaluations: pl.DataFrame, diverged: np.ndarray, threshold: float) 
     """
     by_seed = curves(evaluations)
     longest = max(curve.return_mean.size for curve in by_seed.values())
-    found = [
+    rows = [
         seed_statistics(
             curve, threshold, missing=longest - curve.return_mean.size if diverged[seed] else 0
         )
         for seed, curve in by_seed.items()
     ]
-    return SeedStatistics(*(np.array(column, float) for column in zip(*found, strict=True)))
+    return SeedStatistics(*(np.array(column, float) for column in zip(*rows, strict=True)))
 
 
 def summarise(
@@ -172,66 +174,97 @@ def summarise(
         threshold: the return that counts as solved.
         max_episodes: of the run.
         interacts: whether the method acts in the environment; one that never does has a single
-            evaluation, and nothing to converge by.
+            evaluation and no convergence.
     """
     diverged = seeds["diverged"].to_numpy()
-    columns = of_seeds(evaluations, diverged, threshold)
-    converged = np.isfinite(columns.convergence_env_step)
+    statistics = of_seeds(evaluations, diverged, threshold)
+    lived = seeds.filter(~pl.col("diverged"))["episodes"].to_numpy()
     first = evaluations.row(0, named=True)
-    dips = columns.dip_fraction[~np.isnan(columns.dip_fraction)]
-    after = columns.return_after_convergence[converged]
-    best = seeds["best_return"].to_numpy()
-    soft = evaluations.filter(pl.col("protocol") == "soft")["return_mean"].to_numpy()
+    return {
+        **{name: first[name] for name in LABELS if name in first},
+        "seeds": diverged.size,
+        **_convergence(statistics, lived, max_episodes, interacts),
+        **_stability(statistics, interacts),
+        **_returns(statistics, evaluations, seeds, interacts),
+        **_costs(seeds),
+    }
+
+
+def _convergence(
+    statistics: SeedStatistics, lived: np.ndarray, max_episodes: int | None, interacts: bool
+) -> dict[str, Any]:
+    """Columns on when the seeds converged; `lived`, the episodes of those that did not diverge."""
+    converged = np.isfinite(statistics.convergence_env_step)
     # Under a budget of steps a failing seed lives fewer episodes than a succeeding one: statistics
     # over episodes then say something only if no seed failed.
-    lived = seeds.filter(~pl.col("diverged"))["episodes"]
     comparable = interacts and (
         bool(converged.all()) or (max_episodes is not None and bool((lived == max_episodes).all()))
     )
-    restricted = np.where(converged, columns.convergence_episode, float(max_episodes or 0))
-    row: dict[str, Any] = {
-        **{name: first[name] for name in ("expert", "method", "n_demos")},
-        "seeds": diverged.size,
+    restricted = np.where(converged, statistics.convergence_episode, float(max_episodes or 0))
+    return {
         **_interval("converged_fraction", lambda: share(converged), interacts),
         **_interval(
             "convergence_env_step_median",
-            lambda: _from_zero(median(columns.convergence_env_step)),
+            lambda: _from_zero(median(statistics.convergence_env_step)),
             interacts,
         ),
         **_interval(
             "convergence_episode_median",
-            lambda: _from_zero(median(columns.convergence_episode)),
+            lambda: _from_zero(median(statistics.convergence_episode)),
             comparable,
         ),
         "convergence_episode_mean": float(restricted.mean()) if comparable else None,
         "convergence_episode_std": _std(restricted) if comparable else None,
         "convergence_episode_restricted": not bool(converged.all()) if interacts else None,
-        **_interval("sustained_fraction", lambda: share(columns.sustained.astype(bool)), interacts),
+    }
+
+
+def _stability(statistics: SeedStatistics, interacts: bool) -> dict[str, Any]:
+    dips = statistics.dip_fraction[~np.isnan(statistics.dip_fraction)]
+    sustained = statistics.sustained.astype(bool)
+    return {
+        **_interval("sustained_fraction", lambda: share(sustained), interacts),
         **_interval("dip_fraction", lambda: mean(dips), dips.size > 0),
-        **_interval("area", lambda: mean(columns.area)),
-        "final_return_mean": float(columns.final_return.mean()),
-        "final_return_std": _std(columns.final_return),
+    }
+
+
+def _returns(
+    statistics: SeedStatistics, evaluations: pl.DataFrame, seeds: pl.DataFrame, interacts: bool
+) -> dict[str, Any]:
+    converged = np.isfinite(statistics.convergence_env_step)
+    after = statistics.return_after_convergence[converged]
+    best = seeds["best_return"].to_numpy()
+    soft = evaluations.filter(pl.col("protocol") == "soft")["return_mean"].to_numpy()
+    middle = interquartile_mean(statistics.final_return)
+    return {
+        **_interval("area", lambda: mean(statistics.area)),
+        "final_return_mean": float(statistics.final_return.mean()),
+        "final_return_std": _std(statistics.final_return),
         "soft_return_mean": float(soft.mean()) if soft.size else None,
         "soft_return_std": _std(soft),
         "best_return_mean": float(best.mean()),
         "best_return_std": _std(best),
         **_interval("return_after_convergence", lambda: mean(after), interacts and after.size > 0),
+        "iqm": middle.estimate,
+        "iqm_low": middle.low,
+        "iqm_high": middle.high,
     }
-    iqm = interquartile_mean(columns.final_return)
-    row |= {"iqm": iqm.estimate, "iqm_low": iqm.low, "iqm_high": iqm.high}
-    row |= {
-        "env_steps_learner": int(seeds["env_steps"].sum()),
-        "env_steps_demonstrations": int(seeds["demonstration_steps"].sum()),
-        "env_steps_expert": int(seeds["expert_steps"][0]),
-        "diverged": int(diverged.sum()),
-        "gymnasium_return_mean": float(seeds["gymnasium_return"].mean()),
-        "gymnasium_difference_max": float(seeds["gymnasium_difference"].max()),
-    }
-    return row
+
+
+def _costs(seeds: pl.DataFrame) -> dict[str, Any]:
+    """Columns on what the cell took, and on how far Gymnasium agrees."""
+    return seeds.select(
+        env_steps_learner=pl.col("env_steps").cast(pl.Int64).sum(),
+        env_steps_demonstrations=pl.col("demonstration_steps").cast(pl.Int64).sum(),
+        env_steps_expert=pl.col("expert_steps").first(),
+        diverged=pl.col("diverged").sum(),
+        gymnasium_return_mean=pl.col("gymnasium_return").mean(),
+        gymnasium_difference_max=pl.col("gymnasium_difference").max(),
+    ).row(0, named=True)
 
 
 def _from_zero(interval: Interval) -> Interval:
-    """The interval of a count; its empty bounds in a table then all mean 'never'."""
+    """A count's interval: an unbounded lower bound is 0, so an empty one in a table is 'never'."""
     return interval._replace(low=max(interval.low, 0.0))
 
 

@@ -1,6 +1,9 @@
-"""What a run will do, and whether it can: cells, budget, and every refusal before any work."""
+"""From a configuration to a plan: everything that can be refused is refused before any work."""
 
-from typing import NamedTuple
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 
@@ -11,32 +14,108 @@ from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.irl import rewards
 from cmedirl_jax.runs.cells.record import Budget
-from cmedirl_jax.runs.config import StudyConfig
+from cmedirl_jax.runs.cluster.base import ALONE, Cluster
+from cmedirl_jax.runs.config import Expert, ExpertSettings, StudyConfig
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import cells, plain
 from cmedirl_jax.tabular import imitation
 from cmedirl_jax.training import compose
-from cmedirl_jax.training.methods import METHODS, Method
+from cmedirl_jax.training.methods import METHODS
+from cmedirl_jax.training.settings import Settings
 
 
-class Cell(NamedTuple):
-    """A method and its number of demonstrations; 0 for a method that uses none."""
+class Plan(NamedTuple):
+    """The work of a run, from a configuration that has been checked.
 
-    method: Method
-    n_demos: int
+    Attributes:
+        folder: where its results go.
+        config: the configuration as JSON values, for config.json.
+        env: the task.
+        study: the study's seed.
+        asked: method and number of demonstrations of each cell.
+        seeds: how many learners of each.
+        budget: how long they train, and when they are evaluated.
+        settings: every other choice of theirs.
+        subset_size: the largest number of demonstrations of a learner.
+        group: seeds that a device steps together; None: what is fastest.
+        checkpoint_every: seconds from one checkpoint to the next.
+        demos: the demonstrations that the user gave, or None.
+        experts: how demonstrations are made if none were given.
+        expert: which of the experts demonstrate.
+    """
+
+    folder: Path
+    config: dict[str, Any]
+    env: Env
+    study: int
+    asked: list[tuple[str, int]]
+    seeds: int
+    budget: Budget
+    settings: Settings
+    subset_size: int
+    group: int | None
+    checkpoint_every: float
+    demos: Demonstrations | None
+    experts: ExpertSettings
+    expert: Expert
 
     @property
-    def name(self) -> str:
-        """The cell's name in paths and progress."""
-        return f"{self.method.name}-n{self.n_demos}" if self.n_demos else self.method.name
+    def capacity(self) -> int:
+        """Transitions in a learner's replay, and in an expert's: they share a program."""
+        steps = self.budget.max_steps
+        return steps if self.demos is not None else max(steps, self.experts.steps)
+
+    def check_enough(self, pool: Demonstrations) -> None:
+        """Refuse to draw more demonstrations than the pool holds.
+
+        Raises:
+            UserError: saying how many there are.
+        """
+        _check_enough(self.asked, int(pool.episode[-1]) + 1)
 
 
-def cells_of(config: StudyConfig) -> list[Cell]:
-    """The grid's cells; a method without demonstrations has one."""
-    return [
-        Cell(METHODS[name], n_demos)
-        for name in config.methods
-        for n_demos in (config.n_demos if METHODS[name].uses_demonstrations else (0,))
-    ]
+def plan(config: StudyConfig, cluster: Cluster = ALONE) -> Plan:
+    """Check a configuration and work it out; reads the demonstrations that it names.
+
+    Args:
+        config: what the user asks for.
+        cluster: the processes that share the run; process 0 alone reads files.
+
+    Raises:
+        UserError: naming the option, what is wrong and what would be right.
+    """
+    check(config)
+    env = envs.make(config.env)
+    asked = cells.asked(config.methods, config.n_demos)
+    path, demos = config.demos, None
+    if path is not None:
+        demos = cluster.pool_from_writer(lambda: load_demonstrations(path, env, asked))
+    return Plan(
+        folder=config.folder,
+        config=cluster.from_writer(lambda: describe(config)),
+        env=env,
+        study=config.seed,
+        asked=asked,
+        seeds=config.seeds,
+        budget=budget_of(config, env),
+        settings=config.settings,
+        subset_size=max(config.n_demos),
+        group=config.group,
+        checkpoint_every=config.checkpoint_every,
+        demos=demos,
+        experts=config.experts,
+        expert=config.expert,
+    )
+
+
+def describe(config: StudyConfig) -> dict[str, Any]:
+    """The fully resolved configuration as JSON values."""
+    described = plain.plain(config)
+    if config.demos is not None:
+        # Another file under the same name is another configuration.
+        with config.demos.open("rb") as file:
+            described["demos_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+    return described
 
 
 def budget_of(config: StudyConfig, env: Env) -> Budget:
@@ -60,6 +139,7 @@ def check(config: StudyConfig) -> None:
     Raises:
         UserError: naming the option, what is wrong and what would be right.
     """
+    # Names, and lists of them.
     for method in config.methods:
         if method not in METHODS:
             raise UserError(f"--methods: unknown method {method!r}; there are {', '.join(METHODS)}")
@@ -73,10 +153,22 @@ def check(config: StudyConfig) -> None:
             raise UserError(f"--{name.replace('_', '-')}: give one or more, each once")
     if config.demos is not None and not str(config.demos).isprintable():
         raise UserError(f"--demos: {str(config.demos)!r} cannot be printed; give a plainer name")
+    # Numbers.
     if config.max_steps is None and config.max_episodes is None:
         raise UserError("--max-steps: give a number, or give --max-episodes")
     _check_ranges(config)
     _check_epsilon(config.settings.exploration)
+    capacity = budget_of(config, env).max_steps
+    if capacity >= 2**31:
+        raise UserError(f"--max-episodes: makes {capacity} steps, more than 2^31 - 1")
+    # Parts that must fit the task and each other.
+    _check_parts(config, env, capacity)
+    if config.demos is None:
+        asked = cells.asked(config.methods, config.n_demos)
+        _check_enough(asked, config.experts.trajectories)
+
+
+def _check_parts(config: StudyConfig, env: Env, capacity: int) -> None:
     try:
         networks.make(env.spec, config.settings.architecture)
     except ValueError as error:
@@ -87,16 +179,11 @@ def check(config: StudyConfig) -> None:
             rewards.radial_basis(env.spec, config.settings.tabular.centres)
         except ValueError as error:
             raise UserError(f"--tabular: {error}") from error
-    capacity = budget_of(config, env).max_steps
-    if capacity >= 2**31:
-        raise UserError(f"--max-episodes: makes {capacity} steps, more than 2^31 - 1")
     for name in config.methods:
         try:
             compose.compose(env.spec, METHODS[name], config.settings, capacity)
         except ValueError as error:
             raise UserError(f"--methods {name}: {error}") from error
-    if config.demos is None:
-        check_enough(config, config.experts.trajectories)
 
 
 def _check_ranges(config: StudyConfig) -> None:
@@ -117,42 +204,39 @@ def _check_epsilon(settings: ExplorationSettings) -> None:
         raise UserError(f"--exploration.hot-start-factor: makes epsilon {largest:g}, above 1")
 
 
-def load_demonstrations(config: StudyConfig, env: Env) -> Demonstrations:
-    """The file that `--demos` names.
+def load_demonstrations(path: Path, env: Env, asked: Sequence[tuple[str, int]]) -> Demonstrations:
+    """Read the file that `--demos` names.
+
+    Args:
+        path: the file.
+        env: the task.
+        asked: method and number of demonstrations of each cell.
 
     Raises:
         UserError: if it is missing, damaged, foreign, or holds too few.
     """
-    assert config.demos is not None
     try:
-        pool = demonstrations.load(config.demos, env.spec)
+        pool = demonstrations.load(path, env.spec)
     except FileNotFoundError as error:
         raise UserError(
-            f"--demos: there is no file {config.demos}; give one that demonstrations.save wrote"
+            f"--demos: there is no file {path}; give one that demonstrations.save wrote"
         ) from error
     except OSError as error:
-        raise UserError(f"--demos: {config.demos}: {error.strerror}") from error
+        raise UserError(f"--demos: {path}: {error.strerror}") from error
     except ValueError as error:
         raise UserError(f"--demos: {error}") from error
     # The tables have a column of each.
     expert = pool.metadata.get("expert", "")
     if not isinstance(expert, str):
-        raise UserError(f"--demos: {config.demos}: expert in its metadata is {expert!r}, no text")
+        raise UserError(f"--demos: {path}: expert in its metadata is {expert!r}, no text")
     steps = pool.metadata.get("expert_env_steps", 0)
     if type(steps) is not int or not 0 <= steps < 2**63:
-        raise UserError(
-            f"--demos: {config.demos}: expert_env_steps in its metadata is {steps!r}, no count"
-        )
-    check_enough(config, int(pool.episode[-1]) + 1)
+        raise UserError(f"--demos: {path}: expert_env_steps in its metadata is {steps!r}, no count")
+    _check_enough(asked, int(pool.episode[-1]) + 1)
     return pool
 
 
-def check_enough(config: StudyConfig, held: int) -> None:
-    """Refuse to draw more demonstrations than the pool holds.
-
-    Raises:
-        UserError: saying how many there are.
-    """
-    asked = max(cell.n_demos for cell in cells_of(config))
-    if asked > held:
-        raise UserError(f"--n-demos: {asked} asked, the pool holds {held}")
+def _check_enough(asked: Sequence[tuple[str, int]], held: int) -> None:
+    most = max(n_demos for _, n_demos in asked)
+    if most > held:
+        raise UserError(f"--n-demos: {most} asked, the pool holds {held}")

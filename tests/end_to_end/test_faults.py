@@ -19,8 +19,10 @@ from polars.testing import assert_frame_equal
 
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import checkpoint
-from cmedirl_jax.runs.storage import sealing
-from experiments import conclusion, run_grid
+from cmedirl_jax.runs import start
+from cmedirl_jax.runs.cluster.base import ALONE
+from cmedirl_jax.runs.storage import cells
+from experiments import report, run_grid
 from tests.support import ROOT, pools
 
 # Orbax says so on every load that names no shardings.
@@ -35,7 +37,6 @@ RUN = (
 """Two cells of the same program, six chunks each, every one of which is saved."""
 CONTINUE = "start the same command again to go on\n"
 ISOLATED = ("unshare", "--map-root-user", "--mount")
-LEARNED = ("policies", "rewards")
 LIMIT = 300.0
 """Seconds after which a process that should have ended is one that hangs."""
 
@@ -84,7 +85,7 @@ def whole(runs):
 
 
 def assert_same_run(folder, whole):
-    for name in sealing.TABLES:
+    for name in cells.TABLES:
         assert_frame_equal(
             pl.read_parquet(folder / f"{name}.parquet"), pl.read_parquet(whole / f"{name}.parquet")
         )
@@ -97,8 +98,8 @@ def assert_same_run(folder, whole):
     assert {path for path in left if "d" not in path.parts} == {
         path for path in expected if "d" not in path.parts
     }
-    learned = [path.relative_to(whole) for name in LEARNED for path in (whole / name).iterdir()]
-    assert learned
+    learned = [path.relative_to(whole) for path in whole.glob("cells/*/[pr]*s") if path.is_dir()]
+    assert len(learned) == 2 * len(list((whole / "cells").iterdir()))
     for path in learned:
         found, wanted = checkpoint.load(folder / path), checkpoint.load(whole / path)
         chex.assert_trees_all_equal(found, wanted, strict=True)
@@ -111,7 +112,7 @@ def paths(run, pattern):
 
 def progress(run):
     """Steps behind the cells of a run, as far as they are saved."""
-    finished = [path.name for path in paths(run, "policies/*[0-9]")]
+    finished = [path.name for path in paths(run, "cells/[!.]*")]
     begun = [
         path for path in paths(run, "checkpoints/*/[0-9]*") if path.parent.name not in finished
     ]
@@ -158,8 +159,8 @@ def written_since(moment, run, pattern):
 PHASES = {
     "compiling": ("../compiled-*/*", 4.0),
     "training and evaluating": ("checkpoints/*/[0-9]*", 0.5),
-    "saving a checkpoint": ("checkpoints/*/.partial", 0.02),
-    "saving a policy": ("policies/*tmp*", 0.02),
+    "saving a checkpoint": ("checkpoints/*/.*.partial", 0.02),
+    "saving a cell": ("cells/.*.partial", 0.05),
     "writing tables": (".*.parquet.partial", 0.02),
     "drawing": ("figures/*", 0.2),
 }
@@ -221,6 +222,21 @@ def test_a_signal_ends_a_run_with_its_code_and_a_line(runs, whole, tmp_path):
     assert_same_run(run, whole)
 
 
+def test_a_cell_that_another_command_does_not_ask_for_keeps_its_checkpoint(runs, whole, tmp_path):
+    """The command for fewer cells is finished in between, and shows its own."""
+    run = tmp_path / "run"
+    process = runs.start(run)
+    wait_for(process, lambda: progress(run) >= STEPS + 500)
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=LIMIT)
+    assert "[1/1]" not in runs.finish(run, "--n-demos", "1", "--seeds", "3")
+    assert pl.read_parquet(run / "seeds.parquet").select("n_demos", "seed").rows() == [
+        (1, seed) for seed in range(3)
+    ]
+    assert "hs-me-ddpg-n2-seeds-0-3 goes on from its checkpoint" in runs.finish(run)
+    assert_same_run(run, whole)
+
+
 def test_a_run_needs_no_reader(runs, whole, tmp_path):
     """As `| tee log` where a signal ends `tee` too, and then `> /dev/full`."""
     run = tmp_path / "run"
@@ -247,24 +263,24 @@ def test_a_run_needs_no_reader(runs, whole, tmp_path):
 def again(runs, whole, tmp_path, monkeypatch):
     """The command within this process, on a run that is finished."""
     folder = shutil.copytree(whole, tmp_path / "again")
-    monkeypatch.setattr(run_grid, "start_devices", lambda config: jax.devices()[:1])
+    monkeypatch.setattr(start, "start", lambda *_: (ALONE, jax.devices()[:1]))
     return lambda: run_grid.main(runs.command(folder)[3:])
 
 
 def test_a_signal_among_the_figures_ends_a_run_at_once(again, monkeypatch, capfd):
-    monkeypatch.setattr(conclusion, "conclude", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(report, "report", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     assert again() == 130
     assert capfd.readouterr() == ("", f"run_grid: stopped at once; {CONTINUE}")
 
 
 def test_a_signal_before_the_figures_is_obeyed(again, monkeypatch, capfd):
-    finished = sealing.finished
+    finished = cells.finished
 
     def signalled(folder):
         signal.raise_signal(signal.SIGINT)
         return finished(folder)
 
-    monkeypatch.setattr(sealing, "finished", signalled)
+    monkeypatch.setattr(cells, "finished", signalled)
     assert again() == 130
     assert capfd.readouterr().err == f"run_grid: stopped by SIGINT; {CONTINUE}"
 
@@ -307,7 +323,7 @@ def test_a_full_disk_ends_a_run_that_goes_on_once_there_is_room(runs, whole, tmp
     script = """
         mount -t tmpfs -o size=64m none "$DISK"
         "$@" &
-        until test -e "$DISK/run/policies/hs-me-ddpg-n1" && ls "$DISK"/run/checkpoints/*n2/[0-9]*
+        until ls "$DISK"/run/cells/hs-me-ddpg-n1* && ls "$DISK"/run/checkpoints/*n2*/[0-9]*
         do sleep 0.01; done > /dev/null 2> /dev/null
         dd if=/dev/zero of="$DISK/filler" 2> /dev/null || true
         status=0
@@ -334,7 +350,7 @@ def test_a_full_disk_ends_a_run_that_goes_on_once_there_is_room(runs, whole, tmp
     assert "No space left on device" in line
     assert line.endswith(CONTINUE)
     assert "[1/1] hs-me-ddpg-n2" in after
-    assert "hs-me-ddpg-n2 goes on from its checkpoint" in after
+    assert "hs-me-ddpg-n2-seeds-0-3 goes on from its checkpoint" in after
     assert_same_run(tmp_path / "copy", whole)
 
 

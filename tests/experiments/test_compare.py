@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import math
+import shutil
 
 import numpy as np
 import polars as pl
@@ -8,19 +9,22 @@ import pytest
 import scipy.stats
 from hypothesis import given, settings
 
+from cmedirl_jax.runs import validation
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import folder as run_folder
-from cmedirl_jax.runs.storage import sealing
+from cmedirl_jax.runs.storage.cells import CellKey
 from experiments import compare
 from experiments.presets import PRESETS
+from tests.support import cells as cells_of
 from tests.support import damages
 
 STEPS = np.array([0, 100, 200])
 SEEDS = 6
 
 
-def cell(method, n_demos, curves, diverged=()):
-    """Rows of a finished cell whose seeds have these returns at `STEPS`."""
+def save(folder, method, n_demos, curves, diverged=()):
+    """A finished cell whose seeds have these returns at `STEPS`."""
+    key = CellKey(0, "best" if n_demos else "none", method, n_demos, 0, len(curves))
     labels = {"method": method, "n_demos": n_demos}
     evaluations = pl.concat(
         pl.DataFrame(
@@ -38,26 +42,29 @@ def cell(method, n_demos, curves, diverged=()):
     seeds = pl.DataFrame(
         {**labels, "seed": range(len(curves)), "diverged": np.isin(range(len(curves)), diverged)}
     )
-    return {"evaluations": evaluations, "seeds": seeds, "episodes": seeds}
+    rows = {"evaluations": evaluations, "seeds": seeds, "episodes": seeds}
+    return cells_of.save(folder, key, rows)
+
+
+METHODS = ("ddpg", "hs-ddpg", "me-ddpg", "bc", "hs-me-ddpg")
 
 
 def write_config(folder, **changes):
-    config = dataclasses.replace(
-        PRESETS["smoke"], out=folder, seeds=SEEDS, max_steps=200, **changes
-    )
-    with run_folder.opened(config):
+    options = {"methods": METHODS, "n_demos": (5, 7), "seeds": SEEDS, "max_steps": 200} | changes
+    config = dataclasses.replace(PRESETS["smoke"], out=folder, **options)
+    with run_folder.opened(folder, validation.describe(config)):
         pass
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """Method b reaches 90 a hundred steps before a, but for a seed that never does."""
+    """HS-DDPG reaches 90 a hundred steps before DDPG, but for a seed that never does."""
     write_config(tmp_path)
     slow, fast, never = [0, 20, 95], [10, 95, 95], [0, 0, 0]
-    sealing.append(tmp_path, cell("a", 0, [slow] * SEEDS))
-    sealing.append(tmp_path, cell("b", 5, [*[fast] * (SEEDS - 1), never]))
-    sealing.append(tmp_path, cell("c", 5, [slow] * SEEDS))
-    sealing.append(tmp_path, cell("never-acts", 5, [[95]] * SEEDS))
+    save(tmp_path, "ddpg", 0, [slow] * SEEDS)
+    save(tmp_path, "hs-ddpg", 5, [*[fast] * (SEEDS - 1), never])
+    save(tmp_path, "me-ddpg", 5, [slow] * SEEDS)
+    save(tmp_path, "bc", 5, [[95]] * SEEDS)
     return tmp_path
 
 
@@ -66,15 +73,15 @@ def small(tmp_path_factory):
     """A run of two cells, which no test changes for the others."""
     folder = tmp_path_factory.mktemp("small")
     write_config(folder)
-    for method, n_demos in (("a", 0), ("b", 5)):
-        sealing.append(folder, cell(method, n_demos, [[0, 20, 95]] * SEEDS))
+    for method, n_demos in (("ddpg", 0), ("hs-ddpg", 5)):
+        save(folder, method, n_demos, [[0, 20, 95]] * SEEDS)
     return folder
 
 
 def test_differences_are_of_pairs_of_seeds(folder):
-    table = compare.compare(folder, "a")
-    assert table["method"].unique(maintain_order=True).to_list() == ["b", "c"]
-    found = {row["measure"]: row for row in table.filter(pl.col("method") == "b").to_dicts()}
+    table = compare.compare(folder, "ddpg")
+    assert table["method"].unique(maintain_order=True).to_list() == ["hs-ddpg", "me-ddpg"]
+    found = {row["measure"]: row for row in table.filter(pl.col("method") == "hs-ddpg").to_dicts()}
     steps = np.array([-100.0] * (SEEDS - 1) + [0.0])  # Never counts as the last step.
     area = np.array([85 / 3] * (SEEDS - 1) + [-115 / 3])
     final = np.array([0.0] * (SEEDS - 1) + [-95.0])
@@ -89,27 +96,27 @@ def test_differences_are_of_pairs_of_seeds(folder):
         means = expected @ signs / SEEDS
         p_value = min(2 * np.mean(means <= -abs(expected.mean()) + 1e-9), 1.0)
         assert found[name]["p_value"] == pytest.approx(p_value)
-    same = table.filter(pl.col("method") == "c")
+    same = table.filter(pl.col("method") == "me-ddpg")
     assert same["difference"].to_list() == [0.0] * 3
     assert same["p_value"].to_list() == [1.0] * 3
 
 
 def test_a_diverged_seed_stands_at_its_lowest_return(folder):
-    sealing.append(folder, cell("d", 5, [*[[0, 20, 95]] * (SEEDS - 1), [30, 95]], diverged=[5]))
-    table = compare.compare(folder, "a").filter(pl.col("method") == "d")
+    save(folder, "hs-me-ddpg", 5, [*[[0, 20, 95]] * (SEEDS - 1), [30, 95]], diverged=[5])
+    table = compare.compare(folder, "ddpg").filter(pl.col("method") == "hs-me-ddpg")
     difference = dict(table.select("measure", "difference").iter_rows())
     assert difference["final_return"] == pytest.approx((30 - 95) / SEEDS)
     assert difference["area"] == pytest.approx(((30 + 95 + 30) - 115) / 3 / SEEDS)
 
 
 def test_cells_are_compared_at_their_own_number_of_demonstrations(folder):
-    sealing.append(folder, cell("b", 7, [[0, 0, 95]] * SEEDS))
-    sealing.append(folder, cell("c", 7, [[0, 0, 95]] * SEEDS))
-    table = compare.compare(folder, "b").filter(pl.col("measure") == "convergence_env_step")
+    save(folder, "hs-ddpg", 7, [[0, 0, 95]] * SEEDS)
+    save(folder, "me-ddpg", 7, [[0, 0, 95]] * SEEDS)
+    table = compare.compare(folder, "hs-ddpg").filter(pl.col("measure") == "convergence_env_step")
     found = {
         tuple(row[:2]): row[2] for row in table.select("method", "n_demos", "difference").rows()
     }
-    assert found == {("c", 5): pytest.approx(100 * (SEEDS - 1) / SEEDS), ("c", 7): 0.0}
+    assert found == {("me-ddpg", 5): pytest.approx(100 * (SEEDS - 1) / SEEDS), ("me-ddpg", 7): 0.0}
 
 
 @pytest.mark.parametrize(
@@ -121,7 +128,7 @@ def test_runs_without_paired_curves_are_refused(tmp_path, change, named):
     written = json.loads(path.read_text())
     written["config"] |= change
     path.write_text(json.dumps(written))
-    sealing.append(tmp_path, cell("ddpg", 0, [[0, 20, 95]]))
+    save(tmp_path, "ddpg", 0, [[0, 20, 95]])
     with pytest.raises(UserError, match=named):
         compare.compare(tmp_path, "ddpg")
 
@@ -140,17 +147,17 @@ def test_holm_rejects_no_less_than_bonferroni_and_no_more_than_single_tests():
 
 def test_the_command_prints_and_writes_the_table(folder, tmp_path, capsys):
     out = tmp_path / "differences.csv"
-    assert compare.main([str(folder), "--against", "a", "--out", str(out)]) == 0
-    assert "mean paired difference to a" in capsys.readouterr().out
+    assert compare.main([str(folder), "--against", "ddpg", "--out", str(out)]) == 0
+    assert "mean paired difference to ddpg" in capsys.readouterr().out
     assert pl.read_csv(out).height == 2 * 3
 
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["nowhere"], "nowhere: holds no finished cell"),
-        (["{folder}", "--against", "ddpg"], "holds no 'ddpg'; its methods are a, b, c"),
-        (["{folder}", "--against", "never-acts"], "holds no 'never-acts'"),
+        (["nowhere"], "nowhere: holds no run"),
+        (["{folder}", "--against", "gail"], "holds no 'gail'; its methods are ddpg, hs-ddpg, me-"),
+        (["{folder}", "--against", "bc"], "holds no 'bc'"),
     ],
 )
 def test_mistakes_are_refused_in_a_line(folder, arguments, named, capsys):
@@ -160,12 +167,17 @@ def test_mistakes_are_refused_in_a_line(folder, arguments, named, capsys):
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["config.json", "evaluations.parquet", "seeds.parquet"])
+CELL = "cells/ddpg-seeds-0-5"
+
+
+@pytest.mark.parametrize(
+    "name", ["config.json", f"{CELL}/evaluations.parquet", f"{CELL}/seeds.parquet"]
+)
 @settings(max_examples=50)
 @given(damage=damages.damages())
 def test_a_damaged_file_of_a_run_is_a_users_error_or_harmless(small, name, damage):
     with damages.done_to(small / name, damage):
-        table, refusal = damages.attempt(UserError, compare.compare, small, "a")
+        table, refusal = damages.attempt(UserError, compare.compare, small, "ddpg")
     if refusal is not None:
         assert str(small) in refusal
         assert "\n" not in refusal
@@ -179,12 +191,15 @@ def test_a_damaged_file_of_a_run_is_a_users_error_or_harmless(small, name, damag
         ("config.json", b""),
         ("config.json", b"[" * 100_000),
         ("config.json", b'{"config": []}'),
-        ("config.json", b'{"config": {"max_episodes": null, "seeds": "many"}}'),
-        ("evaluations.parquet", b"PAR1"),
-        ("evaluations.parquet", pl.DataFrame({"another": [1]})),
-        ("evaluations.parquet", pl.DataFrame({"method": ["a"], "n_demos": [0]})),
-        ("seeds.parquet", pl.DataFrame({"method": ["a"], "n_demos": [0]})),
-        ("seeds.parquet", None),
+        (
+            "config.json",
+            b'{"schema": 3, "versions": {}, "config": {"max_episodes": null, "seeds": "many"}}',
+        ),
+        (f"{CELL}/evaluations.parquet", b"PAR1"),
+        (f"{CELL}/evaluations.parquet", pl.DataFrame({"another": [1]})),
+        (f"{CELL}/evaluations.parquet", pl.DataFrame({"method": ["ddpg"], "n_demos": [0]})),
+        (f"{CELL}/seeds.parquet", pl.DataFrame({"method": ["ddpg"], "n_demos": [0]})),
+        (f"{CELL}/seeds.parquet", None),
     ],
 )
 def test_a_run_of_other_files_is_refused_in_a_line(small, name, content, capsys):
@@ -195,20 +210,18 @@ def test_a_run_of_other_files_is_refused_in_a_line(small, name, content, capsys)
         path.unlink()
     else:
         content.write_parquet(path)
-    assert compare.main([str(small), "--against", "a"]) == 2
+    assert compare.main([str(small), "--against", "ddpg"]) == 2
     path.write_bytes(whole)
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.startswith(f"compare: {small}")
-    assert "damaged" in captured.err
+    assert "damaged" in captured.err or "not a readable configuration" in captured.err
     assert captured.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("curves", [[[0, 1, 2]] * (SEEDS - 1), [[0, math.nan, 2]] * SEEDS])
 def test_cells_of_fewer_seeds_or_undefined_returns_are_refused(small, curves):
-    whole = {path: path.read_bytes() for path in small.iterdir()}
-    sealing.append(small, cell("c", 5, curves))
-    with pytest.raises(UserError, match=f"c has no finite returns of {SEEDS} seeds"):
-        compare.compare(small, "a")
-    for path, content in whole.items():
-        path.write_bytes(content)
+    path = save(small, "me-ddpg", 5, curves)
+    with pytest.raises(UserError, match=f"me-ddpg has no finite returns of {SEEDS} seeds"):
+        compare.compare(small, "ddpg")
+    shutil.rmtree(path)

@@ -84,17 +84,6 @@ def test_a_budget_of_both_takes_the_smaller(max_steps, expected):
     assert validation.budget_of(config, envs.make(config.env)).max_steps == expected
 
 
-def test_a_method_without_demonstrations_has_one_cell():
-    config = dataclasses.replace(PRESETS["tuned"], methods=("ddpg", "me-ddpg"), n_demos=(1, 10))
-    cells = validation.cells_of(config)
-    assert [(cell.method.name, cell.n_demos) for cell in cells] == [
-        ("ddpg", 0),
-        ("me-ddpg", 1),
-        ("me-ddpg", 10),
-    ]
-    assert [cell.name for cell in cells] == ["ddpg", "me-ddpg-n1", "me-ddpg-n10"]
-
-
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_is_what_the_command_line_makes_of_its_name(name):
     assert parse(["--preset", name]) == PRESETS[name]

@@ -12,18 +12,20 @@ from polars.testing import assert_frame_equal
 
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import checkpoint
-from cmedirl_jax.runs import run as run_lib
+from cmedirl_jax.runs import load_policy, load_reward, start, train, validation
 from cmedirl_jax.runs.cells import experts
+from cmedirl_jax.runs.cluster.base import ALONE
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import folder as run_folder
-from cmedirl_jax.runs.storage import sealing
+from cmedirl_jax.runs.storage import tables
+from cmedirl_jax.training import evaluation
 from cmedirl_jax.training.methods import METHODS
-from experiments import run_grid
+from experiments import report, run_grid
 from tests.support import ROOT, pools
 
 SMOKE = ("--preset", "smoke")
-START_DEVICES = run_grid.start_devices
-TABLES = tuple(f"{name}.parquet" for name in sealing.TABLES)
+START = start.start
+TABLES = tables.FILES
 
 
 def snapshot(folder):
@@ -47,7 +49,7 @@ def run_command(*arguments, **environment):
 def main(tmp_path, monkeypatch):
     """The command in an empty working directory, on a device of this process."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run_grid, "start_devices", lambda config: jax.devices()[:1])
+    monkeypatch.setattr(start, "start", lambda *_: (ALONE, jax.devices()[:1]))
     return lambda *arguments: run_grid.main([str(argument) for argument in arguments])
 
 
@@ -159,7 +161,7 @@ def test_what_only_the_library_finds_is_refused_too(refused, arguments, option):
 
 
 def test_more_devices_than_there_are_are_refused(refused, monkeypatch):
-    monkeypatch.setattr(run_grid, "start_devices", START_DEVICES)
+    monkeypatch.setattr(start, "start", START)
     assert refused("--devices", 10**6, "--out", "run").startswith("--devices: 1000000 asked, there")
 
 
@@ -270,11 +272,12 @@ def test_a_folder_that_cannot_be_made_is_refused(refused, tmp_path, out):
 
 
 @pytest.mark.parametrize(
-    ("option", "before", "now"), [("--seeds", 8, 3), ("--agent.tau", 0.01, 0.5)]
+    ("option", "before", "now"), [("--seed", 0, 3), ("--agent.tau", 0.01, 0.5)]
 )
 def test_another_configuration_in_the_same_folder_is_refused(refused, option, before, now):
     arguments = (*SMOKE, "--out", "run")
-    with run_folder.opened(run_grid.parse(arguments)):
+    config = run_grid.parse(arguments)
+    with run_folder.opened(config.folder, validation.describe(config)):
         pass
     line = refused(*arguments, option, now)
     assert line.startswith(f"--out: run holds a run with {option} {before}, not {now};")
@@ -316,8 +319,8 @@ def smoke(tmp_path_factory, compiled):
     return folder, done
 
 
-CELLS = {("ddpg", 0): "ddpg"} | {
-    (method, 5): f"{method}-n5" for method in ("hs-ddpg", "me-ddpg", "hs-me-ddpg")
+CELLS = {("ddpg", 0): "ddpg-seeds-0-7"} | {
+    (method, 5): f"{method}-n5-seeds-0-7" for method in ("hs-ddpg", "me-ddpg", "hs-me-ddpg")
 }
 SEEDS, STEPS = 8, (0, 250, 500)
 
@@ -325,29 +328,30 @@ SEEDS, STEPS = 8, (0, 250, 500)
 def test_a_run_leaves_what_the_design_lists_and_nothing_unfinished(smoke):
     folder, done = smoke
     assert {path.name for path in folder.iterdir()} == {
-        *("config.json", "summary.csv", "demonstrations", "figures", "policies", "rewards"),
+        *("config.json", "summary.csv", "demonstrations", "cells", "figures"),
         ".lock",
-        *sealing.FILES,
+        *TABLES,
     }
     figures = {path.name: path.stat().st_size for path in (folder / "figures").iterdir()}
     assert figures.keys() == {"figure3.png", "figure3.svg"}
     assert all(figures.values())
-    assert {path.name for path in (folder / "policies").iterdir()} == set(CELLS.values())
-    assert {path.name for path in (folder / "rewards").iterdir()} == {
-        "me-ddpg-n5",
-        "hs-me-ddpg-n5",
-    }
+    assert {path.name for path in (folder / "cells").iterdir()} == set(CELLS.values())
+    for (method, _), name in CELLS.items():
+        assert {path.name for path in (folder / "cells" / name).iterdir()} == {
+            *("policies", "seal.json", *TABLES),
+            *(("rewards",) if "me" in method else ()),
+        }
     assert json.loads((folder / "config.json").read_text())["config"]["seeds"] == SEEDS
     assert "[1/5] experts" in done.stdout
     # Any array made before the devices are started would leave one.
-    assert f"on {min(run_grid.cores(), 2)} CPU device(s)" in done.stdout
+    assert f"on {min(start.cores(), 2)} CPU device(s)" in done.stdout
     assert str(folder) in done.stdout
 
 
 def test_a_run_evaluates_every_seed_of_every_cell_from_step_0_on(smoke):
     table = pl.read_parquet(smoke[0] / "evaluations.parquet")
     assert set(table.columns) >= {
-        *("expert", "method", "n_demos", "seed", "env_step", "episode"),
+        *("study", "expert", "method", "n_demos", "seed", "env_step", "episode"),
         *("return_mean", "return_std", "goal_fraction", "length_mean", "q_mean", "critic_loss"),
     }
     assert table.select("method", "n_demos", "seed", "env_step").rows() == [
@@ -365,7 +369,7 @@ def test_a_run_evaluates_every_seed_of_every_cell_from_step_0_on(smoke):
 def test_episodes_have_the_designed_columns_and_follow_each_other(smoke):
     table = pl.read_parquet(smoke[0] / "episodes.parquet")
     assert set(table.columns) >= {
-        *("expert", "method", "n_demos", "seed", "episode", "env_step"),
+        *("study", "expert", "method", "n_demos", "seed", "episode", "env_step"),
         *("return", "length", "terminated"),
     }
     assert set(table["method"]) >= {"hs-ddpg", "hs-me-ddpg"}
@@ -377,8 +381,8 @@ def test_episodes_have_the_designed_columns_and_follow_each_other(smoke):
 def test_only_methods_that_use_demonstrations_name_an_expert(smoke):
     for name in TABLES:
         table = pl.read_parquet(smoke[0] / name)
-        assert set(table.select("method", "n_demos", "expert").unique().rows()) == {
-            (method, n_demos, "best" if n_demos else "none") for method, n_demos in CELLS
+        assert set(table.select("study", "method", "n_demos", "expert").unique().rows()) == {
+            (0, method, n_demos, "best" if n_demos else "none") for method, n_demos in CELLS
         }
 
 
@@ -407,7 +411,7 @@ def test_the_summary_has_a_row_per_cell_and_counts_the_steps(smoke, spec):
 
 def test_policies_and_rewards_of_all_seeds_are_kept_and_agree_with_gymnasium(smoke):
     folder, _ = smoke
-    for path in (*(folder / "policies").iterdir(), *(folder / "rewards").iterdir()):
+    for path in (*folder.glob("cells/*/policies"), *folder.glob("cells/*/rewards")):
         leaves = jax.tree.leaves(checkpoint.load(path))
         assert {leaf.shape[0] for leaf in leaves} == {SEEDS}
     seeds = pl.read_parquet(folder / "seeds.parquet")
@@ -419,10 +423,63 @@ def test_policies_and_rewards_of_all_seeds_are_kept_and_agree_with_gymnasium(smo
 def test_a_finished_run_is_left_alone(smoke, main, monkeypatch, capsys):
     folder, done = smoke
     before = snapshot(folder)
-    monkeypatch.setattr(run_lib, "_train_cells", lambda *_: pytest.fail("it trains again"))
+    times = {path: path.stat().st_mtime_ns for path in before if path.name != ".lock"}
+    monkeypatch.setattr(train, "train_cells", lambda *_: pytest.fail("it trains again"))
     assert main(*SMOKE, "--out", folder) == 0
     assert snapshot(folder) == before
+    assert {path: path.stat().st_mtime_ns for path in times} == times
     assert done.stdout.endswith(capsys.readouterr().out)
+
+
+def test_fewer_cells_are_shown_without_training_and_all_again(smoke, main, monkeypatch, tmp_path):
+    folder = shutil.copytree(smoke[0], tmp_path / "run")
+    monkeypatch.setattr(train, "train_cells", lambda *_: pytest.fail("it trains again"))
+    assert main(*SMOKE, "--methods", "me-ddpg", "ddpg", "--seeds", 3, "--out", folder) == 0
+    table = pl.read_parquet(folder / "seeds.parquet")
+    assert table.select("method", "seed").rows() == [
+        (method, seed) for method in ("me-ddpg", "ddpg") for seed in range(3)
+    ]
+    assert pl.read_csv(folder / "summary.csv")["seeds"].to_list() == [3, 3]
+    config = json.loads((folder / "config.json").read_text())["config"]
+    assert (config["methods"], config["seeds"]) == (["me-ddpg", "ddpg"], 3)
+    assert main(*SMOKE, "--out", folder) == 0
+    for name in (*TABLES, "summary.csv", "config.json"):
+        assert (folder / name).read_bytes() == (smoke[0] / name).read_bytes()
+
+
+def test_more_methods_numbers_and_seeds_train_what_is_missing(smoke, compiled, tmp_path):
+    """The numbers of a cell do not depend on the cells beside it."""
+    folder = shutil.copytree(smoke[0], tmp_path / "run")
+    kept = snapshot(folder / "cells")
+    more = ("--methods", "ddpg", "me-ddpg", "--n-demos", 5, 9, "--seeds", 12)
+    done = run_command(*SMOKE, *more, "--out", folder, **compiled)
+    assert done.returncode == 0, done.stderr
+    titles = [line for line in done.stdout.splitlines() if line.startswith("[") and "%" not in line]
+    assert titles == [
+        "[1/3] ddpg, seeds 8 to 11",
+        "[2/3] me-ddpg-n5, seeds 8 to 11",
+        "[3/3] me-ddpg-n9, 12 seeds",
+    ]
+    assert snapshot(folder / "cells").items() >= kept.items()
+    table = pl.read_parquet(folder / "seeds.parquet")
+    assert table.select("method", "n_demos", "seed").rows() == [
+        (*cell, seed)
+        for cell in (("ddpg", 0), ("me-ddpg", 5), ("me-ddpg", 9))
+        for seed in range(12)
+    ]
+    # Seeds 8 to 11 beside another number of demonstrations, and alone.
+    alone = tmp_path / "alone"
+    pool = folder / "demonstrations" / "pool.npz"
+    done = run_command(
+        *(*SMOKE, "--methods", "me-ddpg", "--n-demos", 5, "--seeds", 12),
+        *("--demos", pool, "--out", alone),
+        **compiled,
+    )
+    assert done.returncode == 0, done.stderr
+    of_cell = (pl.col("method") == "me-ddpg") & (pl.col("n_demos") == 5)
+    for name in TABLES:
+        found = pl.read_parquet(folder / name).filter(of_cell)
+        assert_frame_equal(found, pl.read_parquet(alone / name), rel_tol=1e-3, abs_tol=1e-3)
 
 
 def test_figures_that_are_gone_are_drawn_again(smoke, main, tmp_path):
@@ -433,6 +490,51 @@ def test_figures_that_are_gone_are_drawn_again(smoke, main, tmp_path):
     assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
 
 
+def test_a_report_makes_tables_and_figures_again_without_training(smoke, tmp_path, capsys):
+    folder = shutil.copytree(smoke[0], tmp_path / "run")
+    figures = snapshot(folder / "figures")
+    for name in (*TABLES, "summary.csv"):
+        (folder / name).write_bytes(b"damaged")
+    (folder / "figures" / "figure3.png").unlink()
+    assert report.main([str(folder)]) == 0
+    assert capsys.readouterr().out == f"Tables and figures: {folder}\n"
+    for name in (*TABLES, "summary.csv"):
+        assert (folder / name).read_bytes() == (smoke[0] / name).read_bytes()
+    assert snapshot(folder / "figures") == figures
+
+
+def test_a_report_of_what_is_no_finished_run_is_refused(smoke, tmp_path, capsys):
+    def refused(folder):
+        assert report.main([str(folder)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line
+
+    assert refused(tmp_path) == f"report: {tmp_path}: holds no run (there is no config.json)"
+    shutil.copy(smoke[0] / "config.json", tmp_path)
+    assert refused(tmp_path) == f"report: {tmp_path}: holds no finished cell of a run"
+    folder = shutil.copytree(smoke[0], tmp_path / "run")
+    with run_folder.held(folder):
+        assert "another process is at work" in refused(folder)
+    name = CELLS["ddpg", 0]
+    (folder / "cells" / name / "seeds.parquet").unlink()
+    assert f"{name} is damaged (seeds.parquet)" in refused(folder)
+
+
+def test_policies_and_rewards_of_a_run_are_functions(smoke, env):
+    """The best policy returns what its evaluations say."""
+    folder, _ = smoke
+    act = load_policy(folder, "hs-me-ddpg", seed=2)
+    found = evaluation.evaluate(jax.jit(act), env, env.default_params, 10)
+    table = pl.read_parquet(folder / "evaluations.parquet").filter(
+        pl.col("method") == "hs-me-ddpg", pl.col("seed") == 2
+    )
+    assert float(found.return_mean) == pytest.approx(table["return_mean"].max(), abs=1e-3)
+    observation, action = np.zeros((4, 2), np.float32), np.zeros((4, 1), np.float32)
+    r_d = load_reward(folder, "hs-me-ddpg", seed=2)(observation, action)
+    assert r_d.shape == (4,)
+    assert (np.abs(r_d) <= 0.1).all()
+
+
 def test_a_finished_run_refuses_another_configuration(smoke, main, capsys):
     before = snapshot(smoke[0])
     assert main(*SMOKE, "--out", smoke[0], "--expert", "median") == 2
@@ -441,14 +543,10 @@ def test_a_finished_run_refuses_another_configuration(smoke, main, capsys):
 
 
 def test_a_run_cut_off_between_cells_resumes_to_the_same_tables(smoke, compiled, tmp_path):
-    folder = shutil.copytree(
-        smoke[0], tmp_path / "run", ignore=shutil.ignore_patterns(*sealing.FILES)
-    )
-    tables = sealing.read(smoke[0])
-    for method, n_demos in list(CELLS)[:-1]:
-        of_cell = (pl.col("method") == method) & (pl.col("n_demos") == n_demos)
-        sealing.append(folder, {name: table.filter(of_cell) for name, table in tables.items()})
-    (folder / "summary.csv").unlink()
+    last = CELLS["hs-me-ddpg", 5]
+    folder = shutil.copytree(smoke[0], tmp_path / "run", ignore=shutil.ignore_patterns(last))
+    for name in (*TABLES, "summary.csv"):
+        (folder / name).unlink()
 
     done = run_command(*SMOKE, "--out", folder, **compiled)
 
@@ -459,7 +557,7 @@ def test_a_run_cut_off_between_cells_resumes_to_the_same_tables(smoke, compiled,
     assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
 
 
-@pytest.mark.skipif(run_grid.cores() < 2, reason="there is one core")
+@pytest.mark.skipif(start.cores() < 2, reason="there is one core")
 def test_seeds_do_not_depend_on_the_devices_that_share_them(tmp_path, compiled):
     returns = []
     for devices in (1, 2):
@@ -502,7 +600,7 @@ def test_methods_with_a_model_run_beside_the_others(compiled, demos, tmp_path):
     assert set(evaluations["protocol"]) == {"steps", "soft"}
     assert set(evaluations["env_step"]) == {0}
     for name in ("maxent-irl-n1", "deep-maxent-irl-n2", "tabular-me-ddpg-n2"):
-        reward = checkpoint.load(folder / "rewards" / name)
+        reward = checkpoint.load(folder / "cells" / f"{name}-seeds-0-1" / "rewards")
         assert reward.shape[0] == 2
         assert np.isfinite(reward).all()
     assert {"figure3.png", "figure4.png", "figure5.png"} <= {
@@ -530,10 +628,10 @@ def test_comparators_and_controls_run_beside_the_others(compiled, demos, tmp_pat
     assert evaluations.filter(pl.col("method") == "bc")["env_step"].to_list() == [0, 0]
     learned = evaluations.filter(pl.col("demonstration_reward").is_not_null())
     assert set(learned["method"]) == {"gail"}
-    constant = checkpoint.load(folder / "rewards" / "ddpg-minus-constant")
+    constant = checkpoint.load(folder / "cells/ddpg-minus-constant-seeds-0-1/rewards")
     np.testing.assert_allclose(constant, [-0.1, -0.1])
-    assert {path.name for path in (folder / "rewards").iterdir()} == {
-        "gail-n2",
-        "ddpg-minus-constant",
-        "random-reward",
+    assert {path.parent.name for path in folder.glob("cells/*/rewards")} == {
+        "gail-n2-seeds-0-1",
+        "ddpg-minus-constant-seeds-0-1",
+        "random-reward-seeds-0-1",
     }

@@ -67,7 +67,7 @@ def test_checkpoints_are_flushed(tmp_path, events):
         tmp_path, {}, every=0.0, interruption=Interruption(), say=pytest.fail
     ) as checkpointer:
         checkpointer.save_if_due(250, lambda: ({"weights": np.zeros(3)}, {"rows": np.arange(2)}))
-    assert_safe(events, tmp_path / "250", tmp_path / ".partial")
+    assert_safe(events, tmp_path / "250", tmp_path / ".250.partial")
 
 
 @needs_proc

@@ -1,4 +1,4 @@
-"""Training one cell of the grid: a method, a number of demonstrations, all seeds together."""
+"""Training one cell: a method, a number of demonstrations, a block of seeds side by side."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -9,17 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax.agents.hot_start import HotStartData
-from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells.compiled import CompiledMethod, begin, pack
 from cmedirl_jax.runs.cells.record import Budget, EpisodeRows, EvaluationRows, Record
 from cmedirl_jax.runs.cells.slots import Slots
-from cmedirl_jax.runs.cluster import exchange
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer, Snapshot
 from cmedirl_jax.training import TrainingState
 from cmedirl_jax.training.evaluation import Evaluation
 
 CHUNK = 250
-"""Steps per call of the compiled training loop, and so between looks at the seeds from the host."""
+"""Steps per call of the compiled training loop; the host looks at the seeds in between."""
 
 
 class Progress(NamedTuple):
@@ -30,7 +28,7 @@ class Progress(NamedTuple):
 
 
 class CellResult(NamedTuple):
-    """A finished cell.
+    """A finished cell. Its seeds count from 0, whatever their numbers in the study are.
 
     Attributes:
         evaluations: in the order they were made.
@@ -60,6 +58,7 @@ def train(
     n_demos: int,
     *,
     seeds_count: int,
+    first_seed: int = 0,
     budget: Budget,
     threshold: float,
     report: Callable[[Progress], None],
@@ -73,30 +72,33 @@ def train(
         data: the demonstrations; None for a method without.
         n_demos: how many of them each seed draws.
         seeds_count: how many seeds.
+        first_seed: the number of the first of them in the study.
         budget: how long they train, and when they are evaluated.
         threshold: return that counts as solved, for the reports alone.
-        report: called where training begins or goes on from, and after each chunk.
-        checkpointer: saves the training as it goes, and has what was saved of it before.
+        report: called at the first step or the checkpoint's, and after each chunk.
+        checkpointer: saves the training as it goes, and loads what was saved of it before.
 
     Raises:
         Interrupted: by the checkpointer.
     """
-
     slots = Slots(programs.slots, seeds_count, programs.group, programs.devices)
 
     def init() -> TrainingState:
-        return begin(programs, slots, key, data, n_demos)
+        return begin(programs, slots, key, data, n_demos, first_seed)
 
+    # Begin, or continue from a checkpoint.
     abstract = functools.cache(lambda: jax.eval_shape(init))
     saved = None
     if checkpointer is not None:
         saved = checkpointer.load(
-            lambda arrays: _Training.saved_like(abstract(), seeds_count, arrays)
+            lambda arrays: _saved_like(abstract(), seeds_count, n_demos, arrays)
         )
     if saved is None:
-        training = _Training.begin(programs, data, budget, slots, init())
+        training = _Training.begin(programs, data, n_demos, budget, slots, init())
     else:
-        training = _Training.go_on(programs, data, budget, slots, abstract(), saved)
+        training = _Training.resume(programs, data, n_demos, budget, slots, abstract(), saved)
+
+    # Train, chunk after chunk.
     report(Progress(training.step, training.record.solved_fraction(threshold)))
     for stop in _chunk_ends(training.step, budget):
         if not training.record.running.any():
@@ -115,11 +117,12 @@ class _Training:
         self,
         programs: CompiledMethod,
         data: HotStartData | None,
+        n_demos: int,
         record: Record,
         slots: Slots,
         state: TrainingState,
     ):
-        self.programs, self.data, self.record = programs, data, record
+        self.programs, self.data, self.n_demos, self.record = programs, data, n_demos, record
         self.slots, self.state, self.step = slots, state, 0
         self.best: Any = None
         self.best_return: Any = None
@@ -129,74 +132,67 @@ class _Training:
         cls,
         programs: CompiledMethod,
         data: HotStartData | None,
+        n_demos: int,
         budget: Budget,
         slots: Slots,
         state: TrainingState,
     ) -> "_Training":
-        training = cls(programs, data, Record(slots.seeds, budget), slots, state)
+        """Evaluate the seeds before their first step."""
+        training = cls(programs, data, n_demos, Record(slots.seeds, budget), slots, state)
         every = np.arange(slots.seeds)
-        found = training._evaluate(
+        evaluation = training._evaluate(
             budget.evaluation_starts, slots.groups(np.ones(slots.seeds, bool))
         )
         training.best = _take(state.agent.actor, slots.of_seed)
-        training.best_return = jnp.asarray(found.return_mean)
-        training.record.evaluated("steps", every, found)
+        training.best_return = jnp.asarray(evaluation.return_mean)
+        training.record.evaluated("steps", every, evaluation)
         return training
 
     @classmethod
-    def go_on(
+    def resume(
         cls,
         programs: CompiledMethod,
         data: HotStartData | None,
+        n_demos: int,
         budget: Budget,
         slots: Slots,
         abstract: TrainingState,
         saved: Snapshot,
     ) -> "_Training":
+        """Continue from a checkpoint."""
         slot_seed = saved.record.pop("slot_seed")
         state = saved.state["training"]
+        if abstract.subset is not None:
+            state = _with_subset(state, abstract.subset.start.shape[1])
         if slot_seed.size == slots.seed.size:
-            # Lane by slot as it was: elsewhere in its group a seed might round otherwise.
+            # Every seed in the slot that it had: elsewhere in its group it might round otherwise.
             slots.seed = slot_seed
         else:
             slot = np.argsort(slot_seed)[np.minimum(slots.seed, slots.seeds - 1)]
             state = jax.tree.map(lambda leaf: leaf[slot], state)
         state = jax.tree.map(_typed, abstract, jax.device_put(state, programs.sharding))
-        training = cls(programs, data, Record.from_arrays(saved.record, budget), slots, state)
+        record = Record.from_arrays(saved.record, budget)
+        training = cls(programs, data, n_demos, record, slots, state)
         training.step = saved.step
         training.best, training.best_return = saved.state["best"], saved.state["best_return"]
         return training
 
-    @staticmethod
-    def saved_like(
-        abstract: TrainingState, seeds_count: int, arrays: dict[str, np.ndarray]
-    ) -> dict[str, Any]:
-        """The tree that `snapshot` saved along with `arrays`, with shapes for arrays."""
-
-        def sized(count: int, tree: Any) -> Any:
-            return jax.tree.map(
-                lambda leaf: jax.ShapeDtypeStruct((count, *leaf.shape[1:]), leaf.dtype), tree
-            )
-
-        state = jax.eval_shape(lambda state: jax.tree.map(_untyped, state), abstract)
-        return {
-            "training": sized(arrays["slot_seed"].size, state),
-            "best": sized(seeds_count, state.agent.actor),
-            "best_return": jax.ShapeDtypeStruct((seeds_count,), jnp.float32),
-        }
-
     def snapshot(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """State and record, on the host and apart from what training writes over."""
+        """State and record as copies on the host, which training does not write over."""
         tree = {
             "training": jax.tree.map(_untyped, self.state),
             "best": self.best,
             "best_return": self.best_return,
         }
+        tree = jax.tree.map(np.array, self.programs.evaluator.gather(tree))
+        # Without the padding, whose size depends on the other cells that a command asks for.
+        tree["training"] = _with_subset(tree["training"], self.n_demos)
         arrays = {"slot_seed": self.slots.seed.copy(), **self.record.to_arrays()}
-        return jax.tree.map(np.array, exchange.gather(tree)), arrays
+        return tree, arrays
 
     def advance(self, stop: int) -> None:
         """Take the steps up to `stop`, and evaluate the seeds that are due."""
+        # Train the seeds that run, and those that await their last evaluation.
         record, budget, slots = self.record, self.record.budget, self.slots
         active = record.running | (record.pending & ~record.diverged)
         self.state, groups = pack(self.programs, slots, self.state, active)
@@ -204,32 +200,39 @@ class _Training:
         steps = jnp.arange(self.step, stop, dtype=jnp.int32)
         self.state, log = self.programs.run(self.state, groups, self.data, steps, limit)
         self.step = stop
+
+        # Record what they did, and stop those that diverged.
         was_running = record.running.copy()
         finite, log = self._of_seeds((_finite(self.state), log))
         record.mark_diverged(finite)
         record.stepped(steps=np.asarray(steps), log=log)
+
+        # Evaluate by episodes.
         due = np.flatnonzero(record.due_by_episodes() & ~record.diverged)
         if due.size:
-            found = self._evaluate(budget.evaluation_starts_episodes, groups)
-            record.evaluated("episodes", due, found)
+            evaluation = self._evaluate(budget.evaluation_starts_episodes, groups)
+            record.evaluated("episodes", due, evaluation)
+
+        # Evaluate by steps, and keep each seed's best policy.
         record.pending |= was_running
         over = stop == budget.max_steps or not record.running.any()
         if stop % budget.evaluate_every == 0 or over:
-            found = self._evaluate(budget.evaluation_starts, groups)
+            evaluation = self._evaluate(budget.evaluation_starts, groups)
             due = np.flatnonzero(record.pending & ~record.diverged)
-            record.evaluated("steps", due, found)
+            record.evaluated("steps", due, evaluation)
             record.pending[:] = False
-            returns = np.full(slots.seeds, -np.inf, found.return_mean.dtype)
-            returns[due] = found.return_mean[due]
+            returns = np.full(slots.seeds, -np.inf, np.float32)
+            returns[due] = evaluation.return_mean[due]
             actor = _take(self.state.agent.actor, slots.of_seed)
             self.best, self.best_return = _keep_best(self.best, self.best_return, actor, returns)
 
     def result(self) -> CellResult:
+        """The finished cell."""
         record, state = self.record, self.state
         return CellResult(
             evaluations=record.evaluations,
             episodes=record.episode_rows(),
-            best=exchange.gather(self.best),
+            best=self.programs.evaluator.gather(self.best),
             reward=None if state.reward is None else self._of_seeds(state.reward.params),
             env_steps=record.env_step,
             demonstration_steps=np.zeros(self.slots.seeds, np.int32)
@@ -240,17 +243,51 @@ class _Training:
         )
 
     def _of_seeds(self, tree: Any) -> Any:
-        """What lies in slots, `[slots, ...]`, as numpy `[seeds, ...]`."""
+        """Arrays `[slots, ...]` as numpy `[seeds, ...]`."""
         index = self.slots.of_seed
-        return jax.tree.map(lambda leaf: leaf[index], exchange.gather(tree))
+        return jax.tree.map(lambda leaf: leaf[index], self.programs.evaluator.gather(tree))
 
     def _evaluate(self, starts: int, groups: int) -> Evaluation:
-        found = self.programs.evaluator.on_starts(self.state.agent.actor, starts, groups)
-        return self._of_seeds(evaluator_lib.summarise(found))
+        evaluator = self.programs.evaluator
+        rollouts = evaluator.on_starts(self.state.agent.actor, starts, groups)
+        return self._of_seeds(evaluator.summarise(rollouts))
+
+
+def _saved_like(
+    abstract: TrainingState, seeds_count: int, n_demos: int, arrays: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    """The tree that `_Training.snapshot` saved along with `arrays`, with shapes for arrays."""
+
+    def sized(count: int, tree: Any) -> Any:
+        return jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct((count, *leaf.shape[1:]), leaf.dtype), tree
+        )
+
+    def untyped(state: TrainingState) -> TrainingState:
+        return _with_subset(jax.tree.map(_untyped, state), n_demos)
+
+    state = jax.eval_shape(untyped, abstract)
+    return {
+        "training": sized(arrays["slot_seed"].size, state),
+        "best": sized(seeds_count, state.agent.actor),
+        "best_return": jax.ShapeDtypeStruct((seeds_count,), jnp.float32),
+    }
+
+
+def _with_subset(state: TrainingState, size: int) -> TrainingState:
+    """The state with its demonstrations padded to `size`, or without as much padding."""
+    if state.subset is None:
+        return state
+
+    def resized(leaf: Any) -> Any:
+        leaf = leaf[:, :size]
+        return jnp.pad(leaf, ((0, 0), (0, size - leaf.shape[1])))
+
+    return state.replace(subset=jax.tree.map(resized, state.subset))
 
 
 def _chunk_ends(step: int, budget: Budget) -> Iterator[int]:
-    """Where the chunks after `step` end: `CHUNK` steps at most, none across an evaluation."""
+    """Where the chunks after `step` end: after `CHUNK` steps, or at an evaluation."""
     while step < budget.max_steps:
         next_evaluation = (step // budget.evaluate_every + 1) * budget.evaluate_every
         step = min(step + CHUNK, next_evaluation, budget.max_steps)
@@ -258,7 +295,7 @@ def _chunk_ends(step: int, budget: Budget) -> Iterator[int]:
 
 
 def _untyped(leaf: jax.Array) -> jax.Array:
-    """Random keys as their data, which can be saved."""
+    """Random keys as their data, which orbax saves as an array."""
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 

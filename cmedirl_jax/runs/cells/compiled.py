@@ -1,7 +1,7 @@
-"""The compiled functions of a method, and the slots of seeds that they step."""
+"""The compiled functions of a method that trains networks."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,9 +13,8 @@ from cmedirl_jax.envs import Env
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells.evaluator import Evaluator
-from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.cells.slots import Slots
-from cmedirl_jax.runs.config import StudyConfig
+from cmedirl_jax.runs.cluster.base import ALONE
 from cmedirl_jax.training import Log, TrainingState, seeds
 from cmedirl_jax.training.methods import METHODS, Method
 from cmedirl_jax.training.settings import Settings
@@ -27,10 +26,11 @@ class CompiledMethod(NamedTuple):
     Attributes:
         init: `(keys [slots], groups, data, n_demonstrations) -> TrainingState` `[slots, ...]`.
         run: `(state, groups, data, steps, max_episodes) -> (TrainingState, Log)`; the state is
-            donated. Only the first `groups` groups of slots on each device move.
-        permute: `(state, move [slots]) -> TrainingState`; slot i takes slot move[i]'s. Donated too.
+            donated. Only the first `groups` groups of slots on each device are stepped.
+        permute: `(state, move [slots]) -> TrainingState`: slot i takes the seed of slot move[i].
+            The state is donated.
         evaluator: noise-free rollouts.
-        slots: how many seeds fit in.
+        slots: how many seeds the state has room for.
         group: slots that are stepped together on a device.
         devices: devices that share the slots.
         sharding: how the slots lie on them.
@@ -47,11 +47,11 @@ class CompiledMethod(NamedTuple):
 
 
 def compile_networks(
-    env: Env, architecture: Architecture, group: int, devices: list[jax.Device]
+    env: Env, architecture: Architecture, group: int, devices: Sequence[Any]
 ) -> Callable[[jax.Array, int], Any]:
     """Jit the drawing of the networks that every method starts from: `(keys, groups) -> networks`.
 
-    Apart from `compile_method`, because the random numbers are most of what an `init` compiles.
+    Apart from `compile_method`: drawing them takes most of the time that an `init` compiles.
     """
     trainer = training.make(env, METHODS["ddpg"], Settings(architecture=architecture), capacity=1)
     drawn = seeds.step_groups(lambda key: (key, trainer.draw_networks(key)), group)
@@ -71,7 +71,7 @@ def compile_method(
     *,
     group: int,
     seeds_count: int,
-    devices: list[jax.Device],
+    devices: Sequence[Any],
     capacity: int,
     subset_size: int | None,
 ) -> CompiledMethod:
@@ -93,7 +93,7 @@ def compile_method(
     def permute(state: TrainingState, move: np.ndarray) -> TrainingState:
         return jax.tree.map(lambda leaf: leaf[move], state)
 
-    # One sharding everywhere: another one, even if equivalent, would compile again.
+    # The same sharding everywhere: JAX compiles again for another one, even if it is equivalent.
     split = seeds.sharding(devices)
     start = jax.jit(start, out_shardings=split)
 
@@ -115,11 +115,19 @@ def compile_method(
 
 
 def begin(
-    programs: CompiledMethod, slots: Slots, key: jax.Array, data: HotStartData | None, n_demos: int
+    programs: CompiledMethod,
+    slots: Slots,
+    key: jax.Array,
+    data: HotStartData | None,
+    n_demos: int,
+    first_seed: int = 0,
 ) -> TrainingState:
-    """Initialise the seeds in `slots`; the idle slots behind them hold others."""
+    """Initialise the seeds in `slots`, of which the first is number `first_seed` of the study.
+
+    The idle slots hold further seeds, which are never looked at.
+    """
     groups = slots.groups(np.ones(slots.seeds, bool))
-    keys = seeds.keys(key, programs.slots)[slots.seed]
+    keys = seeds.keys(key, first_seed + programs.slots)[first_seed:][slots.seed]
     return programs.init(keys, groups, data, n_demos)
 
 
@@ -134,38 +142,57 @@ def pack(
 
 
 def compiler(
-    config: StudyConfig, env: Env, budget: Budget, devices: list[jax.Device]
-) -> Callable[[Method, Settings], CompiledMethod]:
-    """A function that makes each method's programs once: for all cells, and for the experts too."""
-    seeds_count, capacity = config.seeds, budget.max_steps
-    if config.demos is None:
-        seeds_count = max(seeds_count, config.experts.seeds)
-        capacity = max(capacity, config.experts.steps)
+    env: Env,
+    devices: Sequence[Any],
+    *,
+    capacity: int,
+    subset_size: int,
+    least_slots: int = 0,
+    group: int | None = None,
+    gather: Callable[[Any], Any] = ALONE.gather,
+) -> Callable[[Method, Settings, int], CompiledMethod]:
+    """A function that compiles a method for a number of seeds, once for all cells that share it.
 
-    def group(architecture: Architecture) -> int:
-        return config.group or seeds.group_size(config.seeds, len(devices), architecture.hidden)
+    Args:
+        env: the task.
+        devices: that share the seeds.
+        capacity: transitions in a replay where the settings leave it open.
+        subset_size: the largest number of demonstrations of a seed.
+        least_slots: seeds that there is room for at least, so that experts share a program.
+        group: seeds that are stepped together on a device; None: what is fastest.
+        gather: arrays of all devices as numpy.
+
+    Returns:
+        `(method, settings, seeds) -> CompiledMethod`. The group depends on these seeds alone, and
+        so do a cell's numbers, whatever else is trained beside it.
+    """
+
+    def group_of(architecture: Architecture, count: int) -> int:
+        return group or seeds.group_size(count, len(devices), architecture.hidden)
 
     @functools.cache
-    def evaluator(architecture: Architecture) -> Evaluator:
-        return evaluator_lib.of_networks(env, architecture, group(architecture), devices)
+    def evaluator(architecture: Architecture, group: int) -> Evaluator:
+        return evaluator_lib.of_networks(env, architecture, group, devices, gather)
 
     @functools.cache
-    def draw_networks(architecture: Architecture) -> Callable:
-        return compile_networks(env, architecture, group(architecture), devices)
+    def draw_networks(architecture: Architecture, group: int) -> Callable:
+        return compile_networks(env, architecture, group, devices)
 
     @functools.cache
-    def compile_once(method: Method, settings: Settings) -> CompiledMethod:
+    def compile_once(method: Method, settings: Settings, count: int) -> CompiledMethod:
+        architecture = settings.architecture
+        size = group_of(architecture, count)
         return compile_method(
             env,
             method,
             settings,
-            evaluator(settings.architecture),
-            draw_networks(settings.architecture),
-            group=group(settings.architecture),
-            seeds_count=seeds_count,
+            evaluator(architecture, size),
+            draw_networks(architecture, size),
+            group=size,
+            seeds_count=max(count, least_slots),
             devices=devices,
             capacity=capacity,
-            subset_size=max(config.n_demos),
+            subset_size=subset_size,
         )
 
     return compile_once

@@ -1,7 +1,7 @@
 """Noise-free rollouts of many seeds' policies, compiled once and shared by every method."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from cmedirl_jax import networks
 from cmedirl_jax.envs import Env
 from cmedirl_jax.networks import Architecture
-from cmedirl_jax.runs.cluster import exchange
+from cmedirl_jax.runs.cluster.base import ALONE
 from cmedirl_jax.training import evaluation, seeds
 from cmedirl_jax.training.evaluation import Evaluation, Rollouts
 
@@ -24,28 +24,50 @@ class Evaluator(NamedTuple):
         on_fresh_starts: `(actors, key, count) -> Rollouts` `[seeds, count]`, from random ones, the
             same for every seed.
         act: `(actor, observation [..., O]) -> action [..., A]` for one seed, not compiled.
+        gather: arrays of all devices as numpy, see `cluster.base.Cluster`.
     """
 
     on_starts: Callable[..., Rollouts]
     on_fresh_starts: Callable[[Any, jax.Array, int], Rollouts]
     act: Callable[[Any, jax.Array], jax.Array]
+    gather: Callable[[Any], Any]
+
+    def summarise(self, rollouts: Rollouts) -> Evaluation:
+        """Each seed's statistics over its starts, `[seeds]`, on the host."""
+        return self.gather(_summarise(rollouts))
+
+
+_summarise = jax.jit(jax.vmap(evaluation.summarise))
 
 
 def of_networks(
-    env: Env, architecture: Architecture, group: int, devices: list[jax.Device]
+    env: Env,
+    architecture: Architecture,
+    group: int,
+    devices: Sequence[Any],
+    gather: Callable[[Any], Any] = ALONE.gather,
 ) -> Evaluator:
-    """An evaluator of actors of one architecture."""
+    """An evaluator of actors of one architecture; see `make`."""
     act = functools.partial(networks.policy, networks.make(env.spec, architecture))
-    return make(env, act, group, devices)
+    return make(env, act, group, devices, gather)
 
 
 def make(
     env: Env,
     act: Callable[[Any, jax.Array], jax.Array],
     group: int,
-    devices: list[jax.Device],
+    devices: Sequence[Any],
+    gather: Callable[[Any], Any] = ALONE.gather,
 ) -> Evaluator:
-    """An evaluator of policies `act(actor, observation)`, `group` at a time on each device."""
+    """An evaluator of policies.
+
+    Args:
+        env: the task.
+        act: `(actor, observation [..., O]) -> action [..., A]`.
+        group: seeds that are evaluated together on a device.
+        devices: that share the seeds.
+        gather: arrays of all devices as numpy.
+    """
     params = env.default_params
 
     def on_starts(actors: Any, count: int, groups: int | None = None) -> Rollouts:
@@ -60,6 +82,7 @@ def make(
 
     @jax.jit
     def spread(actors: Any, starts: Any, groups: int | None = None) -> Rollouts:
+        # Copies of the first seed fill the last group.
         count = jax.tree.leaves(actors)[0].shape[0]
         slots = seeds.padded(count, group, len(devices))
         filled = jax.tree.map(
@@ -68,15 +91,7 @@ def make(
         if groups is None:
             groups = slots // (group * len(devices))
         mapped = seeds.map_devices(seeds.step_groups(one, group), devices)
-        _, found = mapped(filled, groups, starts)
-        return jax.tree.map(lambda x: x[:count], found)
+        _, rollouts = mapped(filled, groups, starts)
+        return jax.tree.map(lambda x: x[:count], rollouts)
 
-    return Evaluator(on_starts, on_fresh_starts, act)
-
-
-def summarise(rollouts: Rollouts) -> Evaluation:
-    """Each seed's statistics over its starts, `[seeds]`, on the host."""
-    return exchange.gather(_summarise(rollouts))
-
-
-_summarise = jax.jit(jax.vmap(evaluation.summarise))
+    return Evaluator(on_starts, on_fresh_starts, act, gather)

@@ -1,4 +1,4 @@
-"""Demonstrations as the paper makes them: DDPG experts trained on the true reward (section 4.1)."""
+"""Demonstrations as in the paper: by DDPG experts trained on the true reward (section 4.1)."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,10 +11,10 @@ from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.runs.cells import cell as cell_lib
-from cmedirl_jax.runs.cells.cell import Progress
+from cmedirl_jax.runs.cells.cell import CellResult, Progress
 from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.record import Budget
-from cmedirl_jax.runs.cluster import exchange
+from cmedirl_jax.runs.cluster.base import ALONE, Cluster
 from cmedirl_jax.runs.config import Expert, ExpertSettings
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
@@ -32,6 +32,7 @@ def make_pool(
     programs: CompiledMethod,
     report: Callable[[Progress], None],
     checkpointer: Checkpointer | None = None,
+    cluster: Cluster = ALONE,
 ) -> Demonstrations:
     """Train experts and record noise-free trajectories, from fresh random starts.
 
@@ -43,11 +44,13 @@ def make_pool(
         programs: DDPG's, with the settings that experts train with.
         report: called after each chunk of training.
         checkpointer: saves the training as it goes.
+        cluster: the processes of the run.
 
     Raises:
         Interrupted: by the checkpointer.
         UserError: if no expert's final policy reaches the environment's threshold.
     """
+    # Train.
     train_key, start_key = jax.random.split(key)
     threshold = env.spec.reward_threshold
     result = cell_lib.train(
@@ -61,10 +64,8 @@ def make_pool(
         report=report,
         checkpointer=checkpointer,
     )
-    final = result.evaluations[-1]
-    returns = np.where(result.diverged, -np.inf, 0.0)
-    alive = ~result.diverged[final.seed]
-    returns[final.seed[alive]] = np.asarray(final.evaluation.return_mean)[alive]
+    # Choose who demonstrates, by the final policies' returns.
+    returns = _final_returns(result)
     chosen = choose(returns, which, threshold)
     if not chosen.size:
         raise UserError(
@@ -72,14 +73,6 @@ def make_pool(
             f"{options.steps} steps; give them more steps (--experts.steps) or seeds, "
             "and the run another folder"
         )
-    actors = jax.tree.map(lambda leaf: jnp.asarray(leaf[chosen]), result.final)
-    per_expert = -(-options.trajectories // chosen.size)
-
-    @jax.jit
-    @jax.vmap
-    def record_all(actor: Any, key: jax.Array) -> tuple[Transition, jax.Array, jax.Array]:
-        return record(programs.evaluator.act, env, actor, key, per_expert)
-
     metadata = {
         "env": env.spec.id,
         "source": "noise-free trajectories of DDPG experts trained on the true reward",
@@ -90,14 +83,30 @@ def make_pool(
         "expert_env_steps": int(result.env_steps.sum()),
     }
 
-    def recorded() -> Demonstrations:
-        columns = record_all(actors, jax.random.split(start_key, chosen.size))
-        return flatten(*jax.tree.map(np.asarray, columns), metadata)
+    # Record, on one process for all: rounding on another machine might give other episodes.
+    per_expert = -(-options.trajectories // chosen.size)
+    record_all = jax.jit(
+        jax.vmap(lambda actor, key: record(programs.evaluator.act, env, actor, key, per_expert))
+    )
 
-    # Once for all processes: another kind of machine might round to episodes of other lengths.
-    pool = exchange.pool_from_writer(recorded)
+    def recorded() -> Demonstrations:
+        actors = jax.tree.map(lambda leaf: jnp.asarray(leaf[chosen]), result.final)
+        columns = record_all(actors, jax.random.split(start_key, chosen.size))
+        transition, running, truncated = jax.tree.map(np.asarray, columns)
+        return flatten(transition, running, truncated, metadata)
+
+    pool = cluster.pool_from_writer(recorded)
     assert pool is not None
     return pool
+
+
+def _final_returns(result: CellResult) -> np.ndarray:
+    """The return of each expert's final policy, `[experts]`; -inf for one that diverged."""
+    final = result.evaluations[-1]
+    returns = np.where(result.diverged, -np.inf, 0.0)
+    alive = ~result.diverged[final.seed]
+    returns[final.seed[alive]] = np.asarray(final.evaluation.return_mean)[alive]
+    return returns
 
 
 def choose(returns: np.ndarray, which: Expert, threshold: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The learned policies replayed in Gymnasium's own environment, against the pure-JAX one."""
+"""The learned policies in Gymnasium's own environment, beside the same episodes in JAX."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,7 +10,6 @@ import numpy as np
 
 from cmedirl_jax.envs import Env
 from cmedirl_jax.runs.cells.evaluator import Evaluator
-from cmedirl_jax.runs.cluster import exchange
 
 STARTS = 3
 """Start states per policy: both ends and the middle of the start interval."""
@@ -25,7 +24,7 @@ class Replay(NamedTuple):
 
 def replay(evaluator: Evaluator, actors: Any, env: Env) -> Replay:
     """Run each seed's policy `[seeds, ...]` from the same starts in both environments."""
-    jax_return = exchange.gather(evaluator.on_starts(actors, STARTS).episode_return)
+    jax_return = evaluator.gather(evaluator.on_starts(actors, STARTS).episode_return)
     act = jax.jit(jax.vmap(evaluator.act))
     return Replay(_run(lambda observations: act(actors, observations), actors, env), jax_return)
 

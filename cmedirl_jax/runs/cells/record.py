@@ -1,7 +1,7 @@
-"""The host's record of a cell in training: who runs, what was evaluated, which episodes ended."""
+"""The host's record of a cell in training: running seeds, evaluations, finished episodes."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -52,7 +52,7 @@ class EvaluationRows(NamedTuple):
         seed: which seeds.
         env_step: steps each had learned from.
         episode: episodes each had finished.
-        evaluation: what was found.
+        evaluation: its statistics.
         means: diagnostics of the updates before it.
     """
 
@@ -75,10 +75,8 @@ class EpisodeRows(NamedTuple):
     terminated: np.ndarray
 
 
-_EVALUATIONS = EvaluationRows(
-    *EvaluationRows._fields[:4], Evaluation(*Evaluation._fields), Means(*Means._fields)
-)
-"""The name of every column in `Record.to_arrays`."""
+_COLUMNS = (*EvaluationRows._fields[:4], *Evaluation._fields, *Means._fields)
+"""The names of an evaluation's leaves in `Record.to_arrays`."""
 
 _SEEDS = ("env_step", "episode", "running", "pending", "diverged", "latest", "_episode_mark")
 
@@ -115,7 +113,7 @@ class Record:
         count = self.env_step.size
         log = jax.tree.map(lambda leaf: leaf[:count], log)
         done = log.done & self.running[:, None]
-        # Rows of np.nonzero are in order of seed, then of step.
+        # The episodes that ended; np.nonzero orders them by seed, then by step.
         seed, at = np.nonzero(done)
         number = self.episode[:, None] + np.cumsum(done, axis=1)
         self._episodes.append(
@@ -123,12 +121,13 @@ class Record:
                 seed=seed,
                 episode=number[seed, at],
                 env_step=steps[at] + 1,
-                episode_return=log.episode_return[seed, at],
-                length=log.episode_length[seed, at],
-                terminated=log.terminated[seed, at],
+                episode_return=np.asarray(log.episode_return)[seed, at],
+                length=np.asarray(log.episode_length)[seed, at],
+                terminated=np.asarray(log.terminated)[seed, at],
             )
         )
         self.episode = self.episode + done.sum(axis=1, dtype=np.int32)
+        # The step after which each seed learned no more.
         end = np.full(count, steps[-1] + 1, np.int32)
         if self.budget.max_episodes is not None:
             finished = self.running & (self.episode >= self.budget.max_episodes)
@@ -136,14 +135,15 @@ class Record:
             end = np.where(finished, steps[last] + 1, end)
         else:
             finished = np.zeros(count, bool)
+        # Sums over the updates until then.
         active = (steps[None, :] < end[:, None]) & self.running[:, None]
         for source, names, updated in (
             (log, OF_AGENT, active & log.learned),
             (log.reward, OF_REWARD, active & log.reward_learned),
         ):
             for name in names if source is not None else ():
-                found = np.where(updated, getattr(source, name), 0.0)
-                getattr(self._sums, name)[:] += found.sum(axis=1)
+                values = np.where(updated, getattr(source, name), 0.0)
+                getattr(self._sums, name)[:] += values.sum(axis=1)
                 getattr(self._updates, name)[:] += updated.sum(axis=1)
         self.env_step = np.where(self.running, end, self.env_step)
         self.running &= ~finished
@@ -163,18 +163,18 @@ class Record:
         self._episode_mark = mark
         return due
 
-    def evaluated(self, protocol: str, due: np.ndarray, found: Evaluation) -> None:
-        """Record an evaluation of the seeds `due`."""
+    def evaluated(self, protocol: str, due: np.ndarray, evaluation: Evaluation) -> None:
+        """Record the `evaluation` `[seeds]` of the seeds `due`."""
         if not due.size:
             return
-        found = jax.tree.map(lambda leaf: np.asarray(leaf)[due], found)
+        evaluation = jax.tree.map(lambda leaf: np.asarray(leaf)[due], evaluation)
         with np.errstate(invalid="ignore"):
             means = jax.tree.map(lambda total, n: total[due] / n[due], self._sums, self._updates)
         self.evaluations.append(
-            EvaluationRows(protocol, due, self.env_step[due], self.episode[due], found, means)
+            EvaluationRows(protocol, due, self.env_step[due], self.episode[due], evaluation, means)
         )
         if protocol == "steps":
-            self.latest[due] = found.return_mean
+            self.latest[due] = evaluation.return_mean
             for totals in (*self._sums, *self._updates):
                 totals[due] = 0.0
 
@@ -191,19 +191,19 @@ class Record:
         )
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """All of it as arrays by name, for `from_arrays`; copies."""
-        # Columns end to end, and how many rows each evaluation has; its protocol as a column too.
-        rows = [
-            found._replace(protocol=np.repeat(found.protocol, len(found.seed)))
-            for found in self.evaluations
+        """The record as arrays by name, for `from_arrays`; copies."""
+        # The evaluations' columns are laid end to end, the protocol as a column among them.
+        leaves = [
+            jax.tree.leaves(rows._replace(protocol=np.repeat(rows.protocol, len(rows.seed))))
+            for rows in self.evaluations
         ]
-        evaluations = jax.tree.map(lambda *columns: np.concatenate(columns), *rows)
-        named = zip(jax.tree.leaves(_EVALUATIONS), jax.tree.leaves(evaluations), strict=True)
+        columns = [np.concatenate(parts) for parts in zip(*leaves, strict=True)]
+        named = zip(_COLUMNS, columns, strict=True)
         arrays = {
             **{name: getattr(self, name) for name in _SEEDS},
             **{f"sums.{name}": column for name, column in self._sums._asdict().items()},
             **{f"updates.{name}": column for name, column in self._updates._asdict().items()},
-            "evaluations": np.array([len(found.seed) for found in self.evaluations]),
+            "evaluations": np.array([len(rows.seed) for rows in self.evaluations]),
             **{f"evaluations.{name}": column for name, column in named},
             **{f"episodes.{name}": x for name, x in self.episode_rows()._asdict().items()},
         }
@@ -211,7 +211,7 @@ class Record:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], budget: Budget) -> "Record":
-        """The record that gave these `arrays`, to be written on."""
+        """The record that `to_arrays` turned into these arrays."""
         record = cls(arrays["running"].size, budget)
         for name in _SEEDS:
             setattr(record, name, arrays[name])
@@ -221,9 +221,18 @@ class Record:
         )
         ends = np.cumsum(arrays["evaluations"])
         for start, stop in zip(ends - arrays["evaluations"], ends, strict=True):
-            rows = jax.tree.map(
-                lambda name, of=slice(start, stop): arrays[f"evaluations.{name}"][of], _EVALUATIONS
+            columns: list[Any] = [arrays[f"evaluations.{name}"][start:stop] for name in _COLUMNS]
+            protocol, seed, env_step, episode, *values = columns
+            split = len(Evaluation._fields)
+            record.evaluations.append(
+                EvaluationRows(
+                    str(protocol[0]),
+                    seed,
+                    env_step,
+                    episode,
+                    Evaluation(*values[:split]),
+                    Means(*values[split:]),
+                )
             )
-            record.evaluations.append(rows._replace(protocol=str(rows.protocol[0])))
         record._episodes = [EpisodeRows(*(arrays[f"episodes.{x}"] for x in EpisodeRows._fields))]
         return record

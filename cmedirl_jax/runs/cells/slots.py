@@ -1,7 +1,7 @@
-"""Which seed lies in which slot of the compiled programs: seeds that have ended cost nothing.
+"""Which seed is in which slot of the compiled programs, so that finished seeds cost nothing.
 
-A program steps the first groups of slots on every device, as many as it is told. The seeds that
-still run are kept in front, dealt evenly over the devices; they move only where that saves a group.
+A program steps the first groups of slots on every device. The running seeds are kept in those
+groups, evenly over the devices; they change their slots only where that saves a group.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ class Slots:
     """The slots of one cell.
 
     Attributes:
-        seed: `[slots]`, the seed in each slot; those from `seeds` on stand for none.
+        seed: `[slots]`, the seed in each slot; numbers from `seeds` on mean an idle slot.
         seeds: how many seeds there are.
         group: slots that are stepped together on a device.
         devices: devices that share the slots, each a block of equal size.
@@ -36,7 +36,7 @@ class Slots:
         """Bring the seeds of `active` to the front if that saves a group.
 
         Returns:
-            The move, `[slots]`: slot i takes over what was in slot move[i]. None if there is none.
+            `[slots]`, where slot i takes the seed of slot move[i]; None if no seed has to move.
         """
         slots = self._slots_of(active)
         move = self._dealt(slots)

@@ -1,6 +1,6 @@
-"""One cell of the grid whose method never acts: maximum-entropy IRL on a grid, all seeds."""
+"""A cell whose method never acts: maximum-entropy IRL on a grid of the task, all seeds."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +14,7 @@ from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.evaluator import Evaluator
 from cmedirl_jax.runs.cells.record import EpisodeRows, EvaluationRows, Means
-from cmedirl_jax.runs.cluster import exchange
+from cmedirl_jax.runs.cluster.base import ALONE
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.discretise import FiniteMDP
@@ -46,7 +46,7 @@ class CompiledFit(NamedTuple):
         mdp: the environment on the grid.
         evaluator: of greedy policies, by tables of preferences `[seeds, S, A]`.
         soft_evaluator: of the soft policies, by tables of log-probabilities `[seeds, S, A]`.
-        devices: that share the seeds.
+        devices: how many share the seeds.
     """
 
     fit: Callable[..., Fitted]
@@ -61,8 +61,9 @@ def compile_method(
     method: Method,
     settings: Settings,
     *,
-    devices: list[jax.Device],
+    devices: Sequence[Any],
     subset_size: int | None,
+    gather: Callable[[Any], Any] = ALONE.gather,
 ) -> CompiledFit:
     """Jit a method's fit and its evaluators. Compiles at first use."""
     kind = method.tabular
@@ -72,13 +73,13 @@ def compile_method(
     def of_seed(key: jax.Array, mdp: FiniteMDP, data: HotStartData, n_demonstrations: int):
         subset_key, fit_key = jax.random.split(key)
         subset = demonstrations.subset(subset_key, data.episodes, n_demonstrations, subset_size)
-        found = imitation.fit(
+        fitted = imitation.fit(
             fit_key, mdp, env.spec, data, subset, kind=kind, settings=settings.tabular
         )
         steps = jnp.sum(subset.length)
-        return Fitted(found.reward, found.policy.log_probabilities, steps)
+        return Fitted(fitted.reward, fitted.policy.log_probabilities, steps)
 
-    # One at a time: each seed's fixed points take as many iterations as they need.
+    # One seed at a time on each device: the fixed points of seeds take unequal iterations.
     fit = seeds.map_devices(seeds.map_groups(of_seed, 1), devices)
 
     def greedy(table: jax.Array, observation: jax.Array) -> jax.Array:
@@ -90,8 +91,8 @@ def compile_method(
     return CompiledFit(
         fit=jax.jit(fit),
         mdp=mdp,
-        evaluator=evaluator_lib.make(env, greedy, 1, devices),
-        soft_evaluator=evaluator_lib.make(discretise.sampled(mdp, env), soft, 1, devices),
+        evaluator=evaluator_lib.make(env, greedy, 1, devices, gather),
+        soft_evaluator=evaluator_lib.make(discretise.sampled(mdp, env), soft, 1, devices, gather),
         devices=len(devices),
     )
 
@@ -103,10 +104,11 @@ def train(
     n_demos: int,
     *,
     seeds_count: int,
+    first_seed: int = 0,
     evaluation_starts: int,
     checkpointer: Checkpointer | None = None,
 ) -> CellResult:
-    """Fit every seed and evaluate its greedy policy, and as protocol "soft" its soft one, once.
+    """Fit every seed; evaluate its greedy policy once, and its soft one as protocol "soft".
 
     Args:
         programs: of the cell's method.
@@ -114,14 +116,15 @@ def train(
         data: the demonstrations.
         n_demos: how many of them each seed draws.
         seeds_count: how many seeds.
+        first_seed: the number of the first of them in the study.
         evaluation_starts: start states of the evaluations.
-        checkpointer: saves the seeds that are fitted, and has what was saved of them before.
+        checkpointer: saves the seeds that are fitted, and loads those that were saved before.
 
     Raises:
         Interrupted: by the checkpointer.
     """
-    # A seed takes seconds: each device fits one between looks from the host.
-    keys = seeds.keys(key, seeds_count + programs.devices)
+    # A seed takes seconds: the host looks for signals after one seed of each device.
+    keys = seeds.keys(key, first_seed + seeds_count + programs.devices)[first_seed:]
     parts: list[Fitted] = []
 
     def fit(keys: jax.Array) -> Fitted:
@@ -138,36 +141,45 @@ def train(
         fitted = _joined(parts)
         return fitted, {"fitted": np.array(len(fitted.reward))}
 
+    # Continue, fit the seeds that are left, and save.
     fitted = 0
     if checkpointer is not None and (saved := checkpointer.load(abstract)) is not None:
         fitted = saved.step
         parts.append(saved.state)
     for first in range(fitted, seeds_count, programs.devices):
-        parts.append(exchange.gather(fit(keys[first : first + programs.devices])))
+        parts.append(programs.evaluator.gather(fit(keys[first : first + programs.devices])))
         if checkpointer is not None:
             checkpointer.save_if_due(first + programs.devices, take)
-    found = jax.tree.map(lambda leaf: leaf[:seeds_count], _joined(parts))
-    table = found.log_probabilities
-    every = np.arange(seeds_count)
-    zeros = np.zeros(seeds_count, np.int32)
+    return _result(
+        programs,
+        jax.tree.map(lambda leaf: leaf[:seeds_count], _joined(parts)),
+        evaluation_starts,
+    )
+
+
+def _result(programs: CompiledFit, fitted: Fitted, evaluation_starts: int) -> CellResult:
+    """Evaluate the fitted seeds, leaves `[seeds, ...]`."""
+    table = fitted.log_probabilities
+    seeds_count = len(table)
+    zeros, nothing = np.zeros(seeds_count, np.int32), np.zeros(0, np.int32)
     unknown = Means(*(np.full(seeds_count, np.nan) for _ in Means._fields))
 
-    def rows(protocol: str, found: Evaluation) -> EvaluationRows:
-        return EvaluationRows(protocol, every, zeros, zeros, found, unknown)
+    def rows(protocol: str, evaluation: Evaluation) -> EvaluationRows:
+        every = np.arange(seeds_count)
+        return EvaluationRows(protocol, every, zeros, zeros, evaluation, unknown)
 
     greedy, soft = (
-        evaluator_lib.summarise(evaluator.on_starts(table, evaluation_starts))
+        evaluator.summarise(evaluator.on_starts(table, evaluation_starts))
         for evaluator in (programs.evaluator, programs.soft_evaluator)
     )
-    nothing = np.zeros(0, np.int32)
     return CellResult(
         evaluations=[rows("steps", greedy), rows("soft", soft)],
         episodes=EpisodeRows(*(nothing for _ in EpisodeRows._fields)),
         best=table,
-        reward=found.reward,
+        reward=fitted.reward,
         env_steps=zeros,
-        demonstration_steps=found.demonstration_steps,
-        diverged=~np.isfinite(found.reward).all(axis=(1, 2)),
+        demonstration_steps=fitted.demonstration_steps,
+        diverged=~np.isfinite(fitted.reward).all(axis=(1, 2)),
         final=table,
     )
 

@@ -1,1 +1,1 @@
-"""One run shared by several processes."""
+"""The processes that share a run, behind one object; the rest of the library knows of none."""

@@ -1,7 +1,4 @@
-"""A process that calls orbax for another which shares its run with more.
-
-Orbax's `save` meets all processes of `jax.distributed`, also when told that one is active.
-"""
+"""Runs orbax in a child process: under `jax.distributed`, `save` waits for every process."""
 
 import atexit
 import contextlib
@@ -18,35 +15,31 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 def call(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function of orbax's, where need be in a process that knows of no others.
-
-    The arguments and the result are pickled then, on their way through a pipe of our own.
-    """
-    if jax.process_count() == 1:
-        return function(*arguments)
+    """Call a function of orbax's in the child. Arguments and result are pickled on the way."""
     with _ONE_AT_A_TIME:
-        clerk = _clerk()
-        clerk.send((function, arguments))
-        error, result = clerk.recv()
+        child = _child()
+        child.send((function, arguments))
+        error, result = child.recv()
     if error is not None:
         raise error
     return result
 
 
 @functools.cache
-def _clerk() -> multiprocessing.connection.Connection:
+def _child() -> multiprocessing.connection.Connection:
+    """Start the child at the first call; it ends with this process."""
     spawn = multiprocessing.get_context("spawn")
-    mine, clerks = spawn.Pipe()
-    spawn.Process(target=_serve, args=(clerks,)).start()
-    clerks.close()
-    atexit.register(mine.close)
-    return mine
+    parents_end, childs_end = spawn.Pipe()
+    spawn.Process(target=_serve, args=(childs_end,)).start()
+    childs_end.close()
+    atexit.register(parents_end.close)
+    return parents_end
 
 
 def _serve(caller: multiprocessing.connection.Connection) -> None:
     """Call what `caller` sends, until it is gone."""
     jax.config.update("jax_platforms", "cpu")
-    # Whoever stops the run stops the caller, who may still want something saved.
+    # A signal to stop reaches the caller too, which may still want a checkpoint saved.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     with contextlib.suppress(EOFError):

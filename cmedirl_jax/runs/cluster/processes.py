@@ -1,4 +1,4 @@
-"""The life of a run's processes: they meet, are watched, and end together; docs/scaling.md."""
+"""Starting and ending a run's processes: they meet, are watched, and end together."""
 
 import errno
 import os
@@ -12,12 +12,13 @@ from collections.abc import Callable, Sequence
 
 import jax
 
-from cmedirl_jax.runs.config import StudyConfig
+from cmedirl_jax.runs.cluster.base import ALONE, Cluster, ClusterOptions
+from cmedirl_jax.runs.cluster.together import Together
 from cmedirl_jax.runs.console import streams
 from cmedirl_jax.runs.errors import UserError
 
 HEARTBEAT_TIMEOUT = 20
-"""Seconds after which a process that has fallen silent counts as dead."""
+"""Seconds without a heartbeat after which a process counts as dead."""
 GONE = (
     "another process is gone, or never came; "
     "start the same command on all machines again to continue"
@@ -25,39 +26,34 @@ GONE = (
 _WORKER = "CMEDIRL_JAX_DISTRIBUTED_WORKER"
 
 
-def check(config: StudyConfig) -> None:
+def check(options: ClusterOptions) -> None:
     """Refuse options that contradict each other.
 
     Raises:
         UserError: naming the option, what is wrong and what would be right.
     """
-    if config.coordinator is None:
+    if options.coordinator is None:
         for name in ("processes", "process_id"):
-            if getattr(config, name) is not None:
+            if getattr(options, name) is not None:
                 raise UserError(f"--{name.replace('_', '-')}: needs --coordinator HOST:PORT")
         return
-    host, _, port = config.coordinator.rpartition(":")
+    host, _, port = options.coordinator.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
-        raise UserError(f"--coordinator: must be HOST:PORT, got {config.coordinator}")
-    if config.processes is None or config.process_id is None:
+        raise UserError(f"--coordinator: must be HOST:PORT, got {options.coordinator}")
+    if options.processes is None or options.process_id is None:
         raise UserError("--coordinator: needs --processes N and --process-id I too")
-    if config.processes < 1:
-        raise UserError(f"--processes: must be at least 1, got {config.processes}")
-    if not 0 <= config.process_id < config.processes:
-        last = config.processes - 1
-        raise UserError(f"--process-id: must be between 0 and {last}, got {config.process_id}")
-
-
-def is_asked(config: StudyConfig) -> bool:
-    """Whether the run has several processes, of which this is one."""
-    return config.distributed or config.coordinator is not None
+    if options.processes < 1:
+        raise UserError(f"--processes: must be at least 1, got {options.processes}")
+    if not 0 <= options.process_id < options.processes:
+        last = options.processes - 1
+        raise UserError(f"--process-id: must be between 0 and {last}, got {options.process_id}")
 
 
 def supervise(module: str, arguments: Sequence[str]) -> int:
     """Run this process's share, `python -m MODULE ARGUMENTS`, in a child; returns its exit code.
 
-    JAX's runtime aborts a process that loses the coordinator, before Python can say a word; so
-    somebody else must. The child ends when this process does.
+    JAX's runtime aborts a process that loses the coordinator before Python can print a line: the
+    parent prints it. The child ends when this process does.
     """
     child = subprocess.Popen(
         [sys.executable, "-m", module, *arguments],
@@ -83,28 +79,30 @@ def is_worker() -> bool:
     return _WORKER in os.environ
 
 
-def join(config: StudyConfig) -> None:
-    """Meet the other processes; before any other use of JAX.
+def join(options: ClusterOptions) -> Cluster:
+    """Meet the other processes, if there are any; before any other use of JAX.
 
     Raises:
         UserError: if JAX's cluster detection finds no cluster, or process 0 cannot listen.
     """
+    if not options.several:
+        return ALONE
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    # Else it listens where that says, and not on the coordinator's port.
-    if config.process_id == 0 and "JAX_COORDINATOR_BIND_ADDRESS" not in os.environ:
-        assert config.coordinator is not None
-        _check_port(int(config.coordinator.rpartition(":")[2]))
-    # At once, unless noted: an exception would leave the others waiting.
+    # The variable moves JAX's listener to another address: the coordinator's port says nothing.
+    if options.process_id == 0 and "JAX_COORDINATOR_BIND_ADDRESS" not in os.environ:
+        assert options.coordinator is not None
+        _check_port(int(options.coordinator.rpartition(":")[2]))
+    # SIGINT ends the process at once: as an exception it would leave the others waiting.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    # It would take SIGTERM for itself.
+    # JAX's preemption service would take SIGTERM.
     jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(
-            config.coordinator,
-            config.processes,
-            config.process_id,
-            # With all four given, JAX looks for no cluster.
-            cluster_detection_method=None if config.coordinator is None else "deactivate",
+            options.coordinator,
+            options.processes,
+            options.process_id,
+            # JAX must look for no cluster where the options describe one.
+            cluster_detection_method=None if options.coordinator is None else "deactivate",
             heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT,
         )
     except ValueError as error:
@@ -112,20 +110,21 @@ def join(config: StudyConfig) -> None:
             f"--distributed: JAX detects no cluster here ({error}); "
             "give --coordinator HOST:PORT --processes N --process-id I"
         ) from error
+    return Together()
 
 
 def _check_port(port: int) -> None:
-    """See that the coordinator can listen on a port, of which JAX would say no more than SIGSEGV.
+    """Check that the coordinator can listen on a port: where it cannot, JAX ends by SIGSEGV.
 
     Raises:
         UserError: if it cannot.
     """
-    # As JAX does: all addresses, by IPv6 where there is such a thing.
+    # JAX listens on all addresses, by IPv6 where the machine has it.
     address = ("::", port) if socket.has_dualstack_ipv6() else ("", port)
     family = socket.AF_INET6 if socket.has_dualstack_ipv6() else socket.AF_INET
     try:
         with socket.socket(family) as listener:
-            # The connections of a run that has just ended are in nobody's way.
+            # Connections of a run that has just ended may linger on the port.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             if family == socket.AF_INET6:
                 listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
@@ -137,10 +136,10 @@ def _check_port(port: int) -> None:
 
 
 def guarded(program: str, run: Callable[[], int]) -> int:
-    """Run a worker's share; where it fails alone end at once, so that the others learn of it."""
+    """Run a worker's share; if it fails alone, end at once so that the other processes notice."""
     try:
         code = run()
-        # What all agree on they may leave in peace: 2, or a signal's code.
+        # All processes end alike with 0, 2 or a signal's code, so none waits for another.
         if code != 1:
             return code
         streams.flush()
@@ -148,7 +147,7 @@ def guarded(program: str, run: Callable[[], int]) -> int:
     except Exception as error:
         # An ordinary exit would wait for the processes that wait for this one.
         lost = any(transport in str(error) for transport in ("Gloo", "NCCL", "oordination"))
-        # A value that never came is a ValueError to whoever looks at it.
+        # Reading an array whose exchange failed raises ValueError.
         if isinstance(error, jax.errors.JaxRuntimeError | ValueError) and lost:
             streams.complain(f"{program}: {GONE}")
         else:

@@ -17,13 +17,13 @@ _HIT, _MISS = "/jax/compilation_cache/cache_hits", "/jax/compilation_cache/cache
 
 @dataclasses.dataclass
 class Cost:
-    """What compiling has cost.
+    """The cost of compiling so far.
 
     Attributes:
-        seconds: spent on tracing, lowering, compiling and reading the cache. A function that is
-            traced within another counts in both, so this is never too little.
+        seconds: for tracing, lowering, compiling and reading the cache. A function traced within
+            another counts twice, so this is an upper bound.
         hits: programs that were found in the cache.
-        misses: programs that were not, though the cache was in use.
+        misses: programs that were looked for in the cache and not found.
     """
 
     seconds: float = 0.0
@@ -33,12 +33,12 @@ class Cost:
 
 @contextlib.contextmanager
 def counted() -> Iterator[Cost]:
-    """The cost of what is compiled in this block, as it grows."""
+    """Count what compiling costs while this block runs."""
     cost = Cost()
 
-    def spent(event: str, seconds: float, **_: str | int) -> None:
+    def spent(event: str, duration_secs: float, **_: str | int) -> None:
         if event in _DURATIONS:
-            cost.seconds += seconds
+            cost.seconds += duration_secs
 
     def happened(event: str, **_: str | int) -> None:
         cost.hits += event == _HIT
@@ -55,7 +55,7 @@ def counted() -> Iterator[Cost]:
 
 def use_cache() -> None:
     """Keep compiled programs in the user's cache folder, unless JAX was told where to keep them."""
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
         folder = platformdirs.user_cache_path("cmedirl_jax", appauthor=False) / "compiled"
         jax.config.update("jax_compilation_cache_dir", str(folder))
     # Small programs too: there are many, and each would be compiled at every start.

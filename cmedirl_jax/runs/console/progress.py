@@ -20,11 +20,11 @@ class Reporter(Protocol):
         ...
 
     def go_on(self, learning_steps: int) -> None:
-        """The part has so many learning steps behind it from before."""
+        """The part continues from a checkpoint that lies so many learning steps ahead."""
         ...
 
     def advance(self, learning_steps: int, solved_fraction: float) -> None:
-        """The part took so many more learning steps; this share of its seeds is solving."""
+        """The part took so many more learning steps; this share of its seeds solves the task."""
         ...
 
 
@@ -48,6 +48,8 @@ def reporter(console: Console, parts: int, total_steps: int) -> Iterator[Reporte
 
 
 class _Live:
+    """A progress bar."""
+
     def __init__(self, progress: Progress, parts: int, total_steps: int):
         self.progress, self.parts, self.part = progress, parts, 0
         self.task = progress.add_task("starting", total=total_steps, rate="-", solved=0.0)
@@ -74,6 +76,8 @@ class _Live:
 
 
 class _Plain:
+    """A line every `PLAIN_INTERVAL` seconds, for logs."""
+
     def __init__(self, console: Console, parts: int, total_steps: int):
         self.console, self.parts, self.total = console, parts, total_steps
         self.part, self.name, self.done = 0, "", 0

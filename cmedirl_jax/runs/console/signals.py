@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM, noted while a run works and obeyed where it can go on from."""
+"""SIGINT and SIGTERM: noted at once, obeyed where the run can be continued later."""
 
 import contextlib
 import os
@@ -9,35 +9,24 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import NoReturn
 
-from cmedirl_jax.runs.cluster import exchange
+from cmedirl_jax.runs.cluster.base import ALONE, Cluster
+from cmedirl_jax.runs.errors import Interrupted
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 TWICE = 1.0
-"""Seconds within which a second signal is the first once more: some schedulers send it twice."""
-
-
-class Interrupted(Exception):
-    """The run stopped because a signal asked it to.
-
-    Attributes:
-        exit_code: 128 and the signal's number, as shells have it.
-    """
-
-    def __init__(self, number: int):
-        super().__init__(signal.Signals(number).name)
-        self.exit_code = 128 + number
+"""Seconds within which a second signal counts as the first: some schedulers send it twice."""
 
 
 class Interruption:
     """Which signal has asked this process to stop, if any."""
 
-    def __init__(self, restore: Callable[[], None] = lambda: None):
+    def __init__(self, cluster: Cluster = ALONE, restore: Callable[[], None] = lambda: None):
         self.signal: int | None = None
-        self._restore = restore
+        self._cluster, self._restore = cluster, restore
 
     def came(self) -> bool:
-        """Whether a signal has asked any process of the run to stop: a collective of them all."""
-        return exchange.any_process(self.signal is not None)
+        """Whether a signal has asked any process of the run to stop."""
+        return self._cluster.any(self.signal is not None)
 
     def stop(self) -> NoReturn:
         """Stop here.
@@ -48,7 +37,7 @@ class Interruption:
         raise Interrupted(signal.SIGTERM if self.signal is None else self.signal)
 
     def release(self) -> None:
-        """Let signals act at once from here on, where there is nothing left to save.
+        """Let signals act at once from here on: there is nothing left to save.
 
         Raises:
             Interrupted: if one came before.
@@ -59,11 +48,12 @@ class Interruption:
 
 
 @contextlib.contextmanager
-def noted(notice: str | None = None) -> Iterator[Interruption]:
-    """Note the first SIGINT or SIGTERM of this block; a later one acts as it would without it.
+def noted(notice: str | None = None, cluster: Cluster = ALONE) -> Iterator[Interruption]:
+    """Note the first SIGINT or SIGTERM of this block; a later one acts as it would outside.
 
     Args:
         notice: written to standard output at the first.
+        cluster: the processes that stop together.
     """
     first = 0.0
     before = {number: signal.getsignal(number) for number in SIGNALS}
@@ -77,17 +67,17 @@ def noted(notice: str | None = None) -> Iterator[Interruption]:
         if interruption.signal is None:
             interruption.signal, first = number, time.monotonic()
             if notice is not None:
-                # `print` may be what the signal interrupts; the reader may have ended by it.
+                # The signal may have interrupted `print`, or ended whoever reads the output.
                 with contextlib.suppress(OSError):
                     os.write(1, notice.encode())
         elif time.monotonic() - first >= TWICE:
             restore()
             signal.raise_signal(number)
 
-    # Descriptor 1 is another file's where the run was started without standard output.
+    # Started without standard output, the process may have another file at descriptor 1.
     if sys.__stdout__ is None:
         notice = None
-    interruption = Interruption(restore)
+    interruption = Interruption(cluster, restore)
     for number in SIGNALS:
         signal.signal(number, note)
     try:

@@ -1,4 +1,4 @@
-"""Standard output and standard error, which a run goes on without where they are gone."""
+"""Standard output and standard error that may fail: a run goes on without them."""
 
 import contextlib
 import os
@@ -7,7 +7,7 @@ from typing import TextIO, cast
 
 
 class _Dispensable:
-    """A stream that leads nowhere from the first failed write on."""
+    """A stream whose text is thrown away once a write has failed."""
 
     def __init__(self, stream: TextIO):
         self._stream = stream
@@ -19,7 +19,7 @@ class _Dispensable:
             encoding = self._stream.encoding
             return self.write(text.encode(encoding, "replace").decode(encoding))
         except OSError:
-            _lead_nowhere(self._stream)
+            _discard(self._stream)
             return len(text)
 
     def flush(self) -> None:
@@ -30,7 +30,7 @@ class _Dispensable:
 
 
 def dispensable() -> TextIO | None:
-    """Standard output, for a writer that may not fail; None where it is closed."""
+    """Standard output that never raises OSError; None where it is closed."""
     return _dispensable(sys.stdout)
 
 
@@ -41,7 +41,7 @@ def complain(line: str) -> None:
 
 
 def flush() -> None:
-    """Flush both; what cannot be written must not fail again when Python does so at its end."""
+    """Flush both. Text that cannot be written is dropped: Python would fail on it at exit."""
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:
             _flush(stream)
@@ -55,11 +55,11 @@ def _flush(stream: TextIO) -> None:
     try:
         stream.flush()
     except OSError:
-        _lead_nowhere(stream)
+        _discard(stream)
 
 
-def _lead_nowhere(stream: TextIO) -> None:
-    # What the stream still holds goes there too. Not every stream has a descriptor.
+def _discard(stream: TextIO) -> None:
+    # The text that the stream still holds is lost too. Not every stream has a descriptor.
     with contextlib.suppress(OSError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         try:

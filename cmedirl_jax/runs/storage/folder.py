@@ -1,11 +1,9 @@
 """The folder of a run: its configuration, its lock, and which files in it are the run's own."""
 
 import contextlib
-import dataclasses
 import hashlib
 import importlib.metadata
 import json
-import math
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -14,47 +12,41 @@ from typing import Any
 
 import filelock
 
-from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.storage import sealing
+from cmedirl_jax.runs.storage import cells, checkpoints, sealing
+from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 
-SCHEMA = 1
 PACKAGES = (
     *("cmedirl-jax", "jax", "jaxlib", "flax", "optax"),
     *("chex", "gymnasium", "numpy", "orbax-checkpoint"),
 )
-FOLDERS = ("demonstrations", "checkpoints", "policies", "rewards", "figures")
-FILES = ("config.json", "summary.csv", *sealing.FILES)
+FOLDERS = (stored_demonstrations.FOLDER, checkpoints.FOLDER, cells.FOLDER, "figures")
+FILES = ("config.json", "summary.csv", *(f"{name}.parquet" for name in cells.TABLES))
+CELLS_ASKED = ("methods", "n_demos", "seeds")
+"""The options that say which cells there are. The same folder may be given others."""
 _LOCK = ".lock"
 _NOT_COMPARED = (
     *("out", "devices", "distributed", "coordinator", "processes", "process_id"),
-    "checkpoint_every",
+    *("checkpoint_every", *CELLS_ASKED),
 )
 
 
-def describe(config: StudyConfig) -> dict[str, Any]:
-    """The fully resolved configuration as JSON values."""
-    described = dataclasses.asdict(config)
-    if config.demos is not None:
-        # Another file under the same name is another configuration.
-        with config.demos.open("rb") as file:
-            described["demos_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
-    return _plain(described)
+def check(folder: Path, config: dict[str, Any]) -> None:
+    """Check that a run can use its folder, which may not be there yet; writes nothing.
 
-
-def check(config: StudyConfig) -> None:
-    """See that the run can use its folder, which need not be there yet; writes nothing.
+    Args:
+        folder: the run's.
+        config: its configuration as JSON values.
 
     Raises:
-        UserError: if it cannot be written, holds a run of another configuration, or what is no run.
+        UserError: if it cannot be written, or holds another configuration's run or other files.
     """
-    folder = config.folder
     path = folder / "config.json"
     if not str(folder).isprintable():
         raise UserError(f"--out: {str(folder)!r} cannot be printed; give a plainer name")
     try:
         if path.exists():
-            _compare(path, describe(config))
+            _compare(folder, config)
         elif folder.is_dir():
             _check_nothing_else_in(folder)
         for name in FOLDERS:
@@ -79,34 +71,36 @@ def _check_nothing_else_in(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def opened(config: StudyConfig) -> Iterator[Path]:
-    """The run's folder with its config.json, held against other processes while in use.
+def opened(folder: Path, config: dict[str, Any]) -> Iterator[list[cells.SavedCell]]:
+    """Hold the run's folder against other processes; gives its finished cells.
 
-    A `UserError` before the first cell is finished leaves what was there before, and nothing else.
+    The folder and its config.json are made where they are missing. A `UserError` before the first
+    cell is finished leaves the folder as it was.
 
     Raises:
-        UserError: as `check`, and if another process holds the folder.
+        UserError: as `check`, if another process holds the folder, or a cell is damaged.
     """
-    check(config)
-    folder = config.folder
+    check(folder, config)
     made = [path for path in (folder, *folder.absolute().parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"--out: cannot write to {folder} ({error.strerror})") from error
     before = set(folder.iterdir())
-    with _held(folder):
+    with held(folder):
         try:
             # Once more: another process may have been here since.
-            check(config)
-            sealing.finished(folder)
-            _clean(folder)
-            _configure(config)
-            yield folder
+            check(folder, config)
+            with naming_the_option():
+                finished = cells.finished(folder)
+            _remove_unfinished(folder)
+            if not (folder / "config.json").exists():
+                _write(folder, {"schema": sealing.SCHEMA, "config": config, "versions": versions()})
+            yield finished
         except UserError:
-            if not sealing.begun(folder):
+            if not cells.any_begun(folder):
                 _remove({folder / name for name in (*FOLDERS, *FILES, _LOCK)} - before)
-                # What somebody else put there meanwhile stays, and so does its folder.
+                # Files that somebody else put there meanwhile stay, and so does their folder.
                 with contextlib.suppress(OSError):
                     for path in made:
                         path.rmdir()
@@ -114,8 +108,12 @@ def opened(config: StudyConfig) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    # The operating system gives the lock up when its process ends, however that ends.
+def held(folder: Path) -> Iterator[None]:
+    """Lock a folder. The operating system unlocks it when the process ends, however that ends.
+
+    Raises:
+        UserError: if another process holds it.
+    """
     lock = filelock.FileLock(folder / _LOCK)
     try:
         lock.acquire(blocking=False)
@@ -129,15 +127,19 @@ def _held(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def _clean(folder: Path) -> None:
+@contextlib.contextmanager
+def naming_the_option() -> Iterator[None]:
+    """Put the option that names the folder before what is wrong in it."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"--out: {error}") from error
+
+
+def _remove_unfinished(folder: Path) -> None:
     """Remove what a process that was killed while writing left behind."""
-    _remove(sealing.partial(folder / name) for name in FILES)
-    for pattern in (
-        "demonstrations/*.partial",
-        "policies/*.orbax-checkpoint-tmp*",
-        "rewards/*.orbax-checkpoint-tmp*",
-    ):
-        _remove(folder.glob(pattern))
+    _remove(sealing.partial(folder / name) for name in (*FILES, stored_demonstrations.FOLDER))
+    _remove((folder / cells.FOLDER).glob(sealing.partial(Path("*")).name))
 
 
 def _remove(paths: Iterable[Path]) -> None:
@@ -148,62 +150,79 @@ def _remove(paths: Iterable[Path]) -> None:
             path.unlink(missing_ok=True)
 
 
-def _configure(config: StudyConfig) -> None:
-    path = config.folder / "config.json"
-    if not path.exists():
-        described = {"schema": SCHEMA, "config": describe(config), "versions": versions()}
-        with sealing.replacing(path) as partial:
-            partial.write_text(json.dumps(described, indent=2) + "\n")
+def remove_checkpoints(folder: Path, names: Iterable[str]) -> None:
+    """Remove the checkpoints of finished cells; others stay for the run that will need them."""
+    for name in names:
+        shutil.rmtree(folder / checkpoints.FOLDER / name, ignore_errors=True)
+    with contextlib.suppress(OSError):
+        (folder / checkpoints.FOLDER).rmdir()
+
+
+def note_cells_asked(folder: Path, config: dict[str, Any]) -> None:
+    """Write to config.json which cells `config` asks for: those that the run's tables show."""
+    written = read(folder)
+    now = written["config"] | {name: config[name] for name in CELLS_ASKED}
+    if now != written["config"]:
+        _write(folder, written | {"config": now})
+
+
+def _write(folder: Path, content: dict[str, Any]) -> None:
+    with sealing.replacing(folder / "config.json") as partial:
+        partial.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """The content of a run's config.json: `config` and `versions`.
+
+    Raises:
+        UserError: if there is none, or it is damaged or of another version.
+    """
+    path = folder / "config.json"
+    try:
+        written = json.loads(path.read_text())
+        schema = written["schema"]
+        if not isinstance(written["config"], dict) or not isinstance(written["versions"], dict):
+            raise TypeError("config or versions is no object")
+    except FileNotFoundError as error:
+        raise UserError(f"{folder}: holds no run (there is no config.json)") from error
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"{path} is not a readable configuration ({reason})") from error
+    if schema != sealing.SCHEMA:
+        raise UserError(
+            f"{path} has schema {schema!r}, this version writes {sealing.SCHEMA}: another "
+            "version began the run; finish it with that one, or choose another folder"
+        )
+    return written
 
 
 def versions() -> dict[str, str]:
-    """Of the packages that a run's numbers depend on."""
+    """The versions of the packages that a run's numbers depend on."""
     return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
 def other_versions(folder: Path) -> dict[str, str]:
     """The versions that began the run, of packages which have another one now."""
-    began = json.loads((folder / "config.json").read_text())["versions"]
-    now = versions()
+    began, now = read(folder)["versions"], versions()
     return {name: version for name, version in began.items() if now.get(name) != version}
 
 
-def identity(config: StudyConfig) -> dict[str, Any]:
-    """What a checkpoint must share with a run that goes on from it."""
-    compared = {
-        name: value for name, value in _flat(describe(config)).items() if name not in _NOT_COMPARED
-    }
+def identity(config: dict[str, Any]) -> dict[str, Any]:
+    """JSON values that a checkpoint shares with a run that continues it."""
+    compared = {name: value for name, value in _flat(config).items() if name not in _NOT_COMPARED}
     digest = hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()
     return {"config": digest, **versions()}
 
 
-def _compare(path: Path, described: dict[str, Any]) -> None:
-    try:
-        written = json.loads(path.read_text())
-        schema, before = written["schema"], _flat(written["config"])
-        if not isinstance(written["versions"], dict):
-            raise TypeError("versions")
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise UserError(f"--out: {path} is not a readable configuration ({error})") from error
-    if schema != SCHEMA:
-        raise UserError(f"--out: {path} has schema {schema!r}, this version writes {SCHEMA}")
-    now = _flat(described)
+def _compare(folder: Path, config: dict[str, Any]) -> None:
+    with naming_the_option():
+        before, now = _flat(read(folder)["config"]), _flat(config)
     for name in sorted(before.keys() | now.keys()):
         if name not in _NOT_COMPARED and before.get(name) != now.get(name):
             raise UserError(
-                f"--out: {path.parent} holds a run with {_option(name)} {before.get(name)}, not "
+                f"--out: {folder} holds a run with {_option(name)} {before.get(name)}, not "
                 f"{now.get(name)}; choose another folder or the same configuration"
             )
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return str(value) if isinstance(value, Path) else value
 
 
 def _flat(nested: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -1,139 +1,114 @@
-"""The tables of a run, which hold its finished cells.
+"""Folders that appear whole, with a seal that says what each of their files held.
 
-A cell is finished once its rows are in all tables. These are replaced one by one, each as a whole;
-tables.json, written before them, has the digests of what was there and of what comes, so that a run
-which was cut off in between is told from one whose files were damaged or changed.
+The seal is `seal.json`: a schema, values of the folder's own, and the SHA-256 of every other file
+and of the seal itself. Checkpoints, finished cells and a run's demonstrations are such folders.
 """
 
 import contextlib
 import hashlib
-import io
 import json
+import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
-
-import polars as pl
+from typing import Any
 
 from cmedirl_jax.io import atomic
-from cmedirl_jax.runs.errors import UserError
 
-SCHEMA = 1
-TABLES = ("seeds", "episodes", "evaluations")
-"""In the order they are written."""
-FILES = ("tables.json", *(f"{name}.parquet" for name in TABLES))
-
-
-def begun(folder: Path) -> bool:
-    """Whether a cell may be finished."""
-    return (folder / "evaluations.parquet").exists()
+SCHEMA = 3
+"""The version of a run's files. Runs of schema 1 had a `tables.json`."""
+SEAL = "seal.json"
+_NOT_AS_WRITTEN = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
+"""Errors that mean a missing file; after other errors the file may still be whole."""
 
 
-def read(folder: Path) -> dict[str, pl.DataFrame]:
-    """The tables of the run, with its finished cells alone; none before the first is finished.
-
-    Raises:
-        UserError: if a table is not as it was written.
-    """
-    contents = _verified(folder)
-    if "evaluations" not in contents:
-        return {}
-    # Through memory: polars would take brackets in a path for a pattern.
-    tables = {name: pl.read_parquet(io.BytesIO(contents[name])) for name in TABLES}
-    cells = tables["evaluations"].select("method", "n_demos").unique()
-    return {
-        name: table.join(cells, on=["method", "n_demos"], how="semi", maintain_order="left")
-        for name, table in tables.items()
-    }
+class Damaged(Exception):
+    """A sealed folder is not as it was written; says which of its files."""
 
 
-def finished(folder: Path) -> set[tuple[str, int]]:
-    """`(method, n_demos)` of the finished cells.
+class OtherSchema(Exception):
+    """A folder was sealed by a version that writes another schema."""
+
+
+@contextlib.contextmanager
+def sealed(path: Path, content: dict[str, Any]) -> Iterator[Path]:
+    """Give a folder to fill, which then becomes `path` in one move; an error leaves nothing.
+
+    Args:
+        path: a name that is free. The folder around it is made.
+        content: JSON values for the seal.
 
     Raises:
-        UserError: if a table is not as it was written.
+        OSError: if it cannot be written, or the name is not free.
+    """
+    unfinished = partial(path)
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    try:
+        yield unfinished
+        seal = {"schema": SCHEMA, **content, "files": _digests(unfinished)}
+        text = json.dumps({**seal, "sha256": _digest(seal)}, indent=2)
+        (unfinished / SEAL).write_text(text + "\n")
+        atomic.replace(unfinished, path)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Check every file of a sealed folder; returns the content of its seal.
+
+    Raises:
+        Damaged: if a file is missing, added or changed.
+        OtherSchema: if the seal is whole and has another schema.
+        OSError: if the system fails to read a file, which may be whole.
     """
     try:
-        tables = read(folder)
-    except UserError as error:
-        raise UserError(f"--out: {error}") from error
-    if not tables:
-        return set()
-    return set(tables["evaluations"].select("method", "n_demos").unique().iter_rows())
+        seal = _read_seal(path)
+        if seal["schema"] != SCHEMA:
+            raise OtherSchema(f"has schema {seal['schema']!r}, this version reads {SCHEMA}")
+        sealed_files, files = seal["files"], _digests(path)
+    except _NOT_AS_WRITTEN as error:
+        raise Damaged(f"is damaged ({Path(error.filename or path).name})") from error
+    for name in sorted(sealed_files.keys() | files.keys()):
+        if sealed_files.get(name) != files.get(name):
+            raise Damaged(f"is damaged ({name})")
+    return seal
 
 
-def append(folder: Path, rows: dict[str, pl.DataFrame]) -> None:
-    """Add a finished cell's rows to every table."""
-    before, contents = read(folder), {}
-    for name in TABLES:
-        table = pl.concat([before[name], rows[name]]) if before else rows[name]
-        # Through memory: a full disk is an OSError then, not one of polars' own.
-        buffer = io.BytesIO()
-        table.write_parquet(buffer)
-        contents[name] = buffer.getvalue()
-    digests = {name: [_digest(_content(folder, name)), _digest(contents[name])] for name in TABLES}
-    with replacing(folder / "tables.json") as partial:
-        partial.write_text(json.dumps({"schema": SCHEMA, "sha256": digests}, indent=2) + "\n")
-    for name in TABLES:
-        with replacing(folder / f"{name}.parquet") as partial:
-            partial.write_bytes(contents[name])
-
-
-def _verified(folder: Path) -> dict[str, bytes]:
-    """The content of each table that is there."""
-    digests = _digests(folder)
-    while True:
-        # The last first: a cell that is added meanwhile replaces them in their order.
-        contents = {name: _content(folder, name) for name in reversed(TABLES)}
-        before, digests = digests, _digests(folder)
-        if before == digests:
-            break
-    found = [_digest(contents[name]) for name in TABLES]
-    possible = [digests[name] for name in TABLES]
-    # The first so many of them replaced: any number, but no other choice of them.
-    for replaced in range(len(TABLES) + 1):
-        if found == [pair[at < replaced] for at, pair in enumerate(possible)]:
-            return {name: content for name, content in contents.items() if content is not None}
-    known = list(zip(TABLES, found, possible, strict=True))
-    foreign = [name for name, digest, pair in known if digest not in pair]
-    older = [name for name, digest, pair in known if digest != pair[1]]
-    name = (foreign or older)[0]
-    raise UserError(f"{folder} holds a damaged table ({name}.parquet is not as it was written)")
-
-
-def _digests(folder: Path) -> dict[str, tuple[str | None, str | None]]:
-    """Of each table before and after the last cell was added."""
-    path = folder / "tables.json"
+def _read_seal(path: Path) -> dict[str, Any]:
     try:
-        written = json.loads(path.read_bytes())
-        schema, pairs = written["schema"], written["sha256"]
-        digests = {name: (pairs[name][0], pairs[name][1]) for name in TABLES}
-    except FileNotFoundError:
-        return dict.fromkeys(TABLES, (None, None))
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror})") from error
+        seal = json.loads((path / SEAL).read_bytes())
+        digest = seal.pop("sha256")
+        if digest == _digest(seal) and "schema" in seal:
+            return seal
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise UserError(f"{folder} holds a damaged table (tables.json)") from error
-    if schema != SCHEMA:
-        raise UserError(f"{path} has schema {schema!r}, this version reads {SCHEMA}")
+        raise Damaged(f"is damaged ({SEAL})") from error
+    raise Damaged(f"is damaged ({SEAL})")
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """The digest of every file below `folder` but the seal."""
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    digests = {}
+    # `rglob` passes over folders that cannot be read.
+    walk = os.walk(folder, onerror=refuse)
+    for path in sorted(Path(parent, name) for parent, _, names in walk for name in names):
+        name = path.relative_to(folder).as_posix()
+        if path.is_file() and name != SEAL:
+            with path.open("rb") as file:
+                digests[name] = hashlib.file_digest(file, "sha256").hexdigest()
     return digests
 
 
-def _content(folder: Path, name: str) -> bytes | None:
-    path = folder / f"{name}.parquet"
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror})") from error
-
-
-def _digest(content: bytes | None) -> str | None:
-    return None if content is None else hashlib.sha256(content).hexdigest()
+def _digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 def partial(path: Path) -> Path:
-    """Where a file lies until it is whole."""
+    """Where a file or a folder lies until it is whole."""
     return path.with_name(f".{path.name}.partial")
 
 

@@ -1,5 +1,8 @@
-"""A cell's result as rows of the run's tables."""
+"""The run's tables: a cell's result as rows, and the rows of the cells that were asked for."""
 
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,75 +11,159 @@ import polars.selectors as cs
 
 from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.gymnasium_replay import Replay
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import cells, sealing
+from cmedirl_jax.runs.storage.cells import TABLES, CellKey, SavedCell
+
+FILES = tuple(f"{name}.parquet" for name in TABLES)
 
 
 def rows(
     result: CellResult,
-    cell: dict[str, Any],
+    key: CellKey,
     *,
     best_return: np.ndarray,
     replay: Replay,
     expert_steps: int,
 ) -> dict[str, pl.DataFrame]:
-    """The rows that a finished cell adds to each table.
+    """The rows of a finished cell in each table.
 
     Args:
         result: the cell.
-        cell: its columns `expert`, `method` and `n_demos`.
+        key: which cell it is.
         best_return: `[seeds]`, of each seed's best policy on fresh starts.
         replay: of the same policies.
         expert_steps: environment steps that the experts were trained for.
     """
-    labels = [pl.lit(value).alias(name) for name, value in cell.items()]
+    labels = [
+        pl.lit(key.study, pl.Int64).alias("study"),
+        *(pl.lit(getattr(key, name)).alias(name) for name in ("expert", "method", "n_demos")),
+    ]
 
-    def labelled(columns: dict[str, Any]) -> pl.DataFrame:
-        # NaN is 'no update yet'.
-        return (
-            pl.DataFrame(columns).select(*labels, pl.all()).with_columns(cs.float().fill_nan(None))
-        )
+    def labelled(table: pl.DataFrame) -> pl.DataFrame:
+        # NaN means 'no update yet'.
+        return table.select(*labels, pl.all()).with_columns(cs.float().fill_nan(None))
 
-    evaluations = pl.concat(
+    return {
+        "evaluations": labelled(_evaluations(result, key.first_seed)),
+        "episodes": labelled(_episodes(result, key.first_seed)),
+        "seeds": labelled(_seeds(result, key.first_seed, best_return, replay, expert_steps)),
+    }
+
+
+def _evaluations(result: CellResult, first_seed: int) -> pl.DataFrame:
+    return pl.concat(
         pl.DataFrame(
             {
-                "protocol": [found.protocol] * len(found.seed),
-                "seed": found.seed.astype(np.int32),
-                "env_step": found.env_step.astype(np.int32),
-                "episode": found.episode.astype(np.int32),
-                **{name: np.asarray(x) for name, x in found.evaluation._asdict().items()},
-                **found.means._asdict(),
+                "protocol": [rows.protocol] * len(rows.seed),
+                "seed": (first_seed + rows.seed).astype(np.int32),
+                "env_step": rows.env_step.astype(np.int32),
+                "episode": rows.episode.astype(np.int32),
+                **{name: np.asarray(x) for name, x in rows.evaluation._asdict().items()},
+                **rows.means._asdict(),
             }
         )
-        for found in result.evaluations
+        for rows in result.evaluations
     ).sort("seed", "env_step", maintain_order=True)
+
+
+def _episodes(result: CellResult, first_seed: int) -> pl.DataFrame:
     episodes = result.episodes
     order = np.lexsort((episodes.episode, episodes.seed))
-    count = len(result.env_steps)
-    difference = np.abs(replay.gymnasium_return - replay.jax_return).max(axis=1)
+    return pl.DataFrame(
+        {
+            "seed": (first_seed + episodes.seed[order]).astype(np.int32),
+            "episode": episodes.episode[order].astype(np.int32),
+            "env_step": episodes.env_step[order].astype(np.int32),
+            "return": episodes.episode_return[order].astype(np.float32),
+            "length": episodes.length[order].astype(np.int32),
+            "terminated": episodes.terminated[order].astype(bool),
+        }
+    )
+
+
+def _seeds(
+    result: CellResult,
+    first_seed: int,
+    best_return: np.ndarray,
+    replay: Replay,
+    expert_steps: int,
+) -> pl.DataFrame:
+    episodes, count = result.episodes, len(result.env_steps)
     finished = np.zeros(count, np.int32)
     np.maximum.at(finished, episodes.seed, episodes.episode.astype(np.int32))
+    difference = np.abs(replay.gymnasium_return - replay.jax_return).max(axis=1)
+    return pl.DataFrame(
+        {
+            "seed": np.arange(first_seed, first_seed + count, dtype=np.int32),
+            "env_steps": result.env_steps.astype(np.int32),
+            "episodes": finished,
+            "demonstration_steps": result.demonstration_steps.astype(np.int32),
+            "expert_steps": np.full(count, expert_steps, np.int64),
+            "diverged": result.diverged,
+            "best_return": best_return.astype(np.float32),
+            "gymnasium_return": replay.gymnasium_return.mean(axis=1),
+            "gymnasium_difference": difference,
+        }
+    )
+
+
+def of_cells(
+    saved: Sequence[SavedCell], asked: Iterable[tuple[str, int]], seeds: int
+) -> dict[str, pl.DataFrame]:
+    """The tables of the cells that were asked for, as far as they are finished.
+
+    Args:
+        saved: the run's finished cells.
+        asked: method and number of demonstrations of each, in the tables' order.
+        seeds: how many seeds of each.
+    """
+    chosen = [
+        cell
+        for method, n_demos in asked
+        for cell in sorted(saved, key=lambda cell: cell.key.first_seed)
+        if (cell.key.method, cell.key.n_demos) == (method, n_demos) and cell.key.first_seed < seeds
+    ]
+    if not chosen:
+        return {}
     return {
-        "evaluations": labelled(evaluations.to_dict(as_series=True)),
-        "episodes": labelled(
-            {
-                "seed": episodes.seed[order].astype(np.int32),
-                "episode": episodes.episode[order].astype(np.int32),
-                "env_step": episodes.env_step[order].astype(np.int32),
-                "return": episodes.episode_return[order].astype(np.float32),
-                "length": episodes.length[order].astype(np.int32),
-                "terminated": episodes.terminated[order].astype(bool),
-            }
-        ),
-        "seeds": labelled(
-            {
-                "seed": np.arange(count, dtype=np.int32),
-                "env_steps": result.env_steps.astype(np.int32),
-                "episodes": finished,
-                "demonstration_steps": result.demonstration_steps.astype(np.int32),
-                "expert_steps": np.full(count, expert_steps, np.int64),
-                "diverged": result.diverged,
-                "best_return": best_return.astype(np.float32),
-                "gymnasium_return": replay.gymnasium_return.mean(axis=1),
-                "gymnasium_difference": difference,
-            }
-        ),
+        name: pl.concat(cell.table(name) for cell in chosen).filter(pl.col("seed") < seeds)
+        for name in TABLES
     }
+
+
+def read(folder: Path, config: dict[str, Any]) -> dict[str, pl.DataFrame]:
+    """The tables that a run's configuration asks for, from its cells, each of which is checked.
+
+    Args:
+        folder: the run's.
+        config: `methods`, `n_demos` and `seeds` say which cells.
+
+    Raises:
+        UserError: if no such cell is finished, or one is damaged.
+    """
+    try:
+        asked = cells.asked(config["methods"], config["n_demos"])
+    except (LookupError, TypeError, ValueError) as error:
+        raise UserError(f"{folder}: its config.json names no cells ({error!r})") from error
+    run_tables = of_cells(cells.finished(folder), asked, config["seeds"])
+    if not run_tables:
+        raise UserError(f"{folder}: holds no finished cell of a run")
+    return run_tables
+
+
+def write(folder: Path, tables: dict[str, pl.DataFrame]) -> None:
+    """Write the run's tables; those that are there already stay untouched."""
+    for name, table in tables.items():
+        buffer = io.BytesIO()
+        table.write_parquet(buffer)
+        write_if_other(folder / f"{name}.parquet", buffer.getvalue())
+
+
+def write_if_other(path: Path, content: bytes) -> bool:
+    """Write a file, unless it has this content; returns whether it was written."""
+    if path.is_file() and path.read_bytes() == content:
+        return False
+    with sealing.replacing(path) as partial:
+        partial.write_bytes(content)
+    return True

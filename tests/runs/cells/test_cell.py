@@ -11,6 +11,7 @@ import pytest
 from cmedirl_jax import training
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.agents.ddpg import DDPGHParams
+from cmedirl_jax.agents.hot_start import HotStartHParams
 from cmedirl_jax.io import checkpoint
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells import cell as cell_lib
@@ -18,7 +19,8 @@ from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells.cell import CellResult, Progress
 from cmedirl_jax.runs.cells.record import Budget
-from cmedirl_jax.runs.console.signals import Interrupted, Interruption
+from cmedirl_jax.runs.console.signals import Interruption
+from cmedirl_jax.runs.errors import Interrupted
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.training import Log
 from cmedirl_jax.training.methods import METHODS
@@ -53,9 +55,8 @@ class Trained(NamedTuple):
     reports: list[Progress]
 
 
-@pytest.fixture(scope="module")
-def programs(env):
-    """Linear DDPG where episodes of 25 steps start near the goal, so that some reach it."""
+def compile_linear(env, method="ddpg", subset_size=None):
+    """Linear networks where episodes of 25 steps start near the goal, so that some reach it."""
     params = env.default_params.replace(
         max_episode_steps=LIMIT, start_low=0.35, start_high=0.44, power=0.004
     )
@@ -65,11 +66,12 @@ def programs(env):
         architecture=Architecture(hidden=(), output_scale=0.3),
         agent=DDPGHParams(actor_learning_rate=1.0, critic_learning_rate=0.1),
         schedule=Schedule(batch_size=4, learning_starts=LEARNING_STARTS),
+        hot_start=HotStartHParams(steps=2),
     )
     devices = jax.devices()[:1]
     return compiled_lib.compile_method(
         short,
-        METHODS["ddpg"],
+        METHODS[method],
         settings,
         evaluator_lib.of_networks(short, settings.architecture, 2, devices),
         compiled_lib.compile_networks(short, settings.architecture, 2, devices),
@@ -77,8 +79,13 @@ def programs(env):
         seeds_count=SEEDS,
         devices=devices,
         capacity=BY_EPISODES.max_steps,
-        subset_size=None,
+        subset_size=subset_size,
     )
+
+
+@pytest.fixture(scope="module")
+def programs(env):
+    return compile_linear(env)
 
 
 def train(
@@ -88,7 +95,10 @@ def train(
     threshold=0.0,
     before_chunk=lambda state, first_step: state,
     checkpointer=None,
+    n_demos=0,
+    first_seed=0,
 ):
+    pool = hot_start.data(pools.scripted()) if n_demos else None
     chunks, reports, seed_keys = [], [], []
 
     def run(state, groups, data, steps, limit):
@@ -109,9 +119,10 @@ def train(
         result = cell_lib.train(
             programs._replace(run=run),
             jax.random.key(5),
-            None,
-            0,
+            pool,
+            n_demos,
             seeds_count=SEEDS,
+            first_seed=first_seed,
             budget=budget,
             threshold=threshold,
             report=reports.append,
@@ -496,7 +507,7 @@ def test_a_cell_goes_on_with_a_seed_that_has_diverged(programs, tmp_path):
     assert_same_results(rest.result, whole.result)
 
 
-def test_a_cell_goes_on_in_other_lanes(programs, by_episodes, tmp_path):
+def test_a_cell_goes_on_in_other_slots(programs, by_episodes, tmp_path):
     with pytest.raises(Interrupted):
         train(programs, BY_EPISODES, checkpointer=checkpointer(tmp_path, stop_after=3))
     wider = programs._replace(slots=programs.slots + 2)
@@ -506,6 +517,27 @@ def test_a_cell_goes_on_in_other_lanes(programs, by_episodes, tmp_path):
         jax.tree.leaves(rest.final), jax.tree.leaves(by_episodes.result.final), strict=True
     ):
         np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_a_cell_goes_on_where_a_command_asks_for_more_demonstrations_elsewhere(env, tmp_path):
+    """Their largest number pads the subset of every seed; the padding is not saved."""
+    narrow, wide = (compile_linear(env, "hs-ddpg", size) for size in (2, 7))
+    budget = dataclasses.replace(BY_STEPS, max_steps=75)
+    whole = train(narrow, budget, n_demos=2)
+    for before, after in ((narrow, wide), (wide, narrow)):
+        folder = tmp_path / ("narrow" if before is narrow else "wide")
+        with pytest.raises(Interrupted):
+            train(before, budget, n_demos=2, checkpointer=checkpointer(folder, stop_after=1))
+        rest = train(after, budget, n_demos=2, checkpointer=checkpointer(folder))
+        assert len(rest.chunks) == 1
+        assert_same_results(rest.result, whole.result)
+
+
+def test_a_later_block_has_the_seeds_of_its_numbers(programs, by_steps):
+    """Seeds 2 to 4, of which the first was the last of seeds 0 to 2."""
+    later = train(programs, BY_STEPS, first_seed=2).result
+    assert episode_rows(later, 0) == [(0, *row[1:]) for row in episode_rows(by_steps.result, 2)]
+    assert_same(actor_of(later.final, 0), actor_of(by_steps.result.final, 2))
 
 
 def test_going_on_does_not_compile_again(programs, tmp_path):

@@ -80,8 +80,8 @@ def test_fresh_starts_are_the_same_for_every_seed_and_follow_the_key(evaluator, 
     assert not np.intersect1d(first[0], other[0]).size
 
 
-def test_summarise_reduces_over_the_starts():
-    found = evaluator_lib.summarise(
+def test_summarise_reduces_over_the_starts(evaluator):
+    found = evaluator.summarise(
         Rollouts(
             episode_return=np.array([[1.0, 3.0], [5.0, 5.0]], np.float32),
             length=np.array([[10, 20], [7, 8]], np.int32),

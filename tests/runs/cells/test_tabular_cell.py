@@ -7,7 +7,8 @@ import pytest
 from cmedirl_jax import tabular
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.runs.cells import tabular_cell
-from cmedirl_jax.runs.console.signals import Interrupted, Interruption
+from cmedirl_jax.runs.console.signals import Interruption
+from cmedirl_jax.runs.errors import Interrupted
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.imitation import TabularSettings
@@ -31,7 +32,7 @@ def programs(env):
     )
 
 
-def train(programs, seeds_count, n_demos=2, checkpointer=None):
+def train(programs, seeds_count, n_demos=2, checkpointer=None, first_seed=0):
     data = hot_start.data(pools.scripted())
     return tabular_cell.train(
         programs,
@@ -39,6 +40,7 @@ def train(programs, seeds_count, n_demos=2, checkpointer=None):
         data,
         n_demos,
         seeds_count=seeds_count,
+        first_seed=first_seed,
         evaluation_starts=2,
         checkpointer=checkpointer,
     )
@@ -102,6 +104,12 @@ def test_a_seed_does_what_it_does_among_more(result, programs):
     # Adam's first steps have the size of its rate, also along gradients that are all rounding.
     alike, other = (np.abs(more.reward[i : i + SEEDS] - result.reward).max() for i in (0, 1))
     assert alike < 0.01 < 0.1 < other
+
+
+def test_a_later_block_has_the_seeds_of_its_numbers(result, programs):
+    later = train(programs, 2, first_seed=1)
+    np.testing.assert_array_equal(later.reward, result.reward[1:])
+    np.testing.assert_array_equal(later.best, result.best[1:])
 
 
 def test_the_number_of_demonstrations_does_not_recompile(programs):

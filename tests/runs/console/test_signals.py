@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from cmedirl_jax.runs.console import signals
-from cmedirl_jax.runs.console.signals import Interrupted
+from cmedirl_jax.runs.errors import Interrupted
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

@@ -1,7 +1,6 @@
 import errno
 import gc
 import hashlib
-import json
 import os
 import resource
 import shutil
@@ -17,9 +16,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cmedirl_jax.io import checkpoint
-from cmedirl_jax.runs.console.signals import Interrupted, Interruption
-from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.storage import checkpoints
+from cmedirl_jax.runs.console.signals import Interruption
+from cmedirl_jax.runs.errors import Interrupted, UserError
+from cmedirl_jax.runs.storage import sealing
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 
 
@@ -176,8 +175,8 @@ def test_a_damaged_checkpoint_is_reported_and_the_one_before_is_loaded(saved, tm
             path.write_bytes(content + b"x")
     found = kept.checkpointer().load(like)
     if found.step == 500:
-        # Only where the manifest still says the same: a changed blank between its values.
-        assert path.name == "manifest.json"
+        # Only where the seal still says the same: a changed blank between its values.
+        assert path.name == "seal.json"
         return
     assert_is(found, 250)
     line, _ = kept.lines
@@ -210,7 +209,7 @@ def test_a_checkpoint_cut_off_while_it_was_written_is_not_seen(kept, monkeypatch
 
 
 def test_what_an_earlier_process_left_unfinished_is_in_nobodys_way(kept):
-    (kept.folder / ".partial" / "state").mkdir(parents=True)
+    (kept.folder / ".125.partial" / "state").mkdir(parents=True)
     kept.save(250)
     assert kept.names() == ["250"]
 
@@ -235,16 +234,12 @@ def test_another_structure_begins_anew_and_says_so(kept):
     assert "holds another structure" in kept.lines[0]
 
 
-@pytest.mark.parametrize("schema", [1, 3])
-def test_another_schema_is_refused_and_kept(kept, schema):
+@pytest.mark.parametrize("schema", [2, 4])
+def test_another_schema_is_refused_and_kept(kept, monkeypatch, schema):
+    monkeypatch.setattr(sealing, "SCHEMA", schema)
     kept.save(250)
-    path = kept.folder / "250" / "manifest.json"
-    manifest = json.loads(path.read_text())
-    # The first schema had no step.
-    del manifest["sha256"], manifest["step"]
-    manifest["schema"] = schema
-    path.write_text(json.dumps({**manifest, "sha256": checkpoints._digest_of(manifest)}))
-    with pytest.raises(UserError, match=f"has schema {schema}, this version reads 2"):
+    monkeypatch.undo()
+    with pytest.raises(UserError, match=f"has schema {schema}, this version reads 3"):
         kept.checkpointer().load(like)
     assert kept.names() == ["250"]
 
@@ -258,7 +253,7 @@ def test_a_checkpoint_that_was_renamed_is_not_of_its_step(kept):
 
 UNREADABLE = {
     "folder": (os, "scandir"),
-    "manifest": (Path, "read_bytes"),
+    "seal": (Path, "read_bytes"),
     "folder of the state": (os, "walk"),
     "files": (hashlib, "file_digest"),
     "record": (np, "load"),

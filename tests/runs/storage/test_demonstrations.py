@@ -1,4 +1,5 @@
 import hashlib
+import json
 
 import numpy as np
 import pytest
@@ -8,38 +9,47 @@ from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from tests.support import pools
 
-ENV = pools.ENV
+SPEC = pools.ENV.spec
 
 
 @pytest.fixture
 def folder(tmp_path):
     stored_demonstrations.save(tmp_path, pools.scripted(3))
-    return tmp_path
+    return tmp_path / "demonstrations"
 
 
 def test_the_pool_comes_back_with_the_digest_that_others_would_take(folder):
-    pool = stored_demonstrations.load(folder, ENV)
+    pool = stored_demonstrations.load(folder.parent, SPEC)
     np.testing.assert_array_equal(pool.transition.action, pools.scripted(3).transition.action)
-    digest, name = (folder / "demonstrations" / "pool.npz.sha256").read_text().split()
-    assert name == "pool.npz"
-    content = (folder / "demonstrations" / "pool.npz").read_bytes()
-    assert digest == hashlib.sha256(content).hexdigest()
+    digests = json.loads((folder / "seal.json").read_text())["files"]
+    content = (folder / "pool.npz").read_bytes()
+    assert digests == {"pool.npz": hashlib.sha256(content).hexdigest()}
+
+
+def test_a_run_that_keeps_none_yet_has_none(tmp_path):
+    assert stored_demonstrations.load(tmp_path, SPEC) is None
 
 
 def test_another_valid_pool_in_its_place_is_refused(folder):
-    demonstrations.save(folder / "demonstrations" / "pool.npz", pools.scripted(4))
-    with pytest.raises(UserError, match=r"^--out: .*pool\.npz is not what this run kept"):
-        stored_demonstrations.load(folder, ENV)
+    demonstrations.save(folder / "pool.npz", pools.scripted(4))
+    with pytest.raises(UserError, match=r"^.*demonstrations is damaged \(pool\.npz\)"):
+        stored_demonstrations.load(folder.parent, SPEC)
 
 
-@pytest.mark.parametrize("missing", ["pool.npz", "pool.npz.sha256"])
-def test_a_pool_that_was_not_kept_to_the_end_is_made_again(folder, missing):
-    (folder / "demonstrations" / missing).unlink()
-    assert stored_demonstrations.load(folder, ENV) is None
+@pytest.mark.parametrize("missing", ["pool.npz", "seal.json"])
+def test_a_pool_of_which_a_file_is_gone_is_refused(folder, missing):
+    (folder / missing).unlink()
+    with pytest.raises(UserError, match=rf"is damaged \({missing}\)"):
+        stored_demonstrations.load(folder.parent, SPEC)
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff", b"\n", b"0" * 64 + b"  pool.npz\n"])
-def test_a_damaged_digest_is_refused(folder, content):
-    (folder / "demonstrations" / "pool.npz.sha256").write_bytes(content)
-    with pytest.raises(UserError, match="is not what this run kept"):
-        stored_demonstrations.load(folder, ENV)
+@pytest.mark.parametrize("content", [b"", b"\xff", b"\n", b"{}"])
+def test_a_damaged_seal_is_refused(folder, content):
+    (folder / "seal.json").write_bytes(content)
+    with pytest.raises(UserError, match=r"is damaged \(seal\.json\)"):
+        stored_demonstrations.load(folder.parent, SPEC)
+
+
+def test_a_pool_of_another_task_is_refused(folder):
+    with pytest.raises(UserError, match=r".*made for environment"):
+        stored_demonstrations.load(folder.parent, SPEC._replace(id="Pendulum-v1"))

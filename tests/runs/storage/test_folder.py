@@ -8,11 +8,15 @@ import pytest
 from hypothesis import given, settings
 
 from cmedirl_jax.irl import IRLHParams
+from cmedirl_jax.runs import validation
 from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import cells, sealing
 from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.runs.storage.cells import CellKey
 from cmedirl_jax.training.settings import Settings
 from experiments.presets import PRESETS
+from tests.support import cells as cells_of
 from tests.support import damages
 
 
@@ -26,10 +30,14 @@ def contents(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def opening(config):
+    return run_folder.opened(config.folder, validation.describe(config))
+
+
 def opened(config):
     """Enter the run's folder and leave it; returns the folder."""
-    with run_folder.opened(config) as folder:
-        return folder
+    with opening(config):
+        return config.folder
 
 
 def test_configuration_is_strict_json_with_versions(tmp_path):
@@ -37,10 +45,9 @@ def test_configuration_is_strict_json_with_versions(tmp_path):
         PRESETS["paper"].settings, reward=IRLHParams(gauge_rate=math.inf)
     )
     config = dataclasses.replace(PRESETS["paper"], out=tmp_path, settings=settings)
-    with run_folder.opened(config) as folder:
-        text = (folder / "config.json").read_text()
+    text = (opened(config) / "config.json").read_text()
     written = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
-    assert written["schema"] == run_folder.SCHEMA
+    assert written["schema"] == sealing.SCHEMA
     assert written["versions"]["jax"] == jax.__version__
     assert written["config"]["n_demos"] == [200]
     assert written["config"]["settings"]["reward"]["gauge_rate"] == "inf"
@@ -59,8 +66,8 @@ def test_the_same_configuration_enters_again_and_changes_nothing(preset, tmp_pat
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"seeds": 3}, "--seeds 100, not 3;"),
-        ({"n_demos": (1, 10)}, "--n-demos [200], not [1, 10];"),
+        ({"seed": 3}, "--seed 0, not 3;"),
+        ({"expert": "all"}, "--expert best, not all;"),
         ({"max_steps": None, "max_episodes": 5}, "--max-episodes None, not 5;"),
         ({"demos": Path(__file__)}, f"--demos None, not {__file__};"),
         (
@@ -80,6 +87,28 @@ def test_another_configuration_is_refused_naming_the_option_and_both_values(conf
     assert contents(folder) == before
 
 
+def test_methods_numbers_and_seeds_may_differ_and_are_noted_once_the_tables_show_them(config):
+    folder = opened(config)
+    before = contents(folder)
+    more = dataclasses.replace(config, methods=("ddpg", "bc"), n_demos=(1, 10), seeds=3)
+    opened(more)
+    assert contents(folder) == before
+    run_folder.note_cells_asked(folder, validation.describe(more))
+    noted = run_folder.read(folder)
+    assert noted["config"] == validation.describe(more)
+    assert noted["versions"] == run_folder.versions()
+    assert opened(config) == folder
+
+
+def test_what_checkpoints_share_does_not_depend_on_the_cells_asked_for(config):
+    def identity(**changes):
+        return run_folder.identity(validation.describe(dataclasses.replace(config, **changes)))
+
+    assert identity(methods=("bc",), n_demos=(1,), seeds=3, checkpoint_every=1.0) == identity()
+    assert identity(seed=1) != identity()
+    assert identity()["jax"] == jax.__version__
+
+
 def test_the_folders_spelling_and_the_devices_are_not_compared(config, monkeypatch):
     folder = opened(config)
     monkeypatch.chdir(folder.parent)
@@ -96,10 +125,11 @@ def test_the_folders_spelling_and_the_devices_are_not_compared(config, monkeypat
         b"[]",
         b"[" * 100_000,
         b'{"config": {}}',
-        b'{"schema": 1}',
-        b'{"schema": 1, "config": []}',
-        b'{"schema": 2, "config": {}}',
-        b'{"schema": 1, "config": {}, "versions": []}',
+        b'{"schema": 3}',
+        b'{"schema": 3, "config": []}',
+        b'{"schema": 3, "config": {}}',
+        b'{"schema": 4, "config": {}, "versions": {}}',
+        b'{"schema": 3, "config": {}, "versions": []}',
     ],
 )
 def test_a_damaged_or_newer_configuration_is_refused_and_kept(config, damaged):
@@ -108,6 +138,18 @@ def test_a_damaged_or_newer_configuration_is_refused_and_kept(config, damaged):
     with pytest.raises(UserError, match=r"^--out: .*config\.json"):
         opened(config)
     assert path.read_bytes() == damaged
+
+
+def test_a_run_begun_by_an_earlier_version_is_refused_in_a_line_that_says_so(config):
+    path = opened(config) / "config.json"
+    path.write_text(path.read_text().replace('"schema": 3', '"schema": 1'))
+    (config.folder / "tables.json").touch()
+    with pytest.raises(UserError) as error:
+        opened(config)
+    assert str(error.value) == (
+        f"--out: {path} has schema 1, this version writes 3: another version began the run; finish "
+        "it with that one, or choose another folder"
+    )
 
 
 @pytest.mark.parametrize("below", ["file", "file/run", "file/deep/run"])
@@ -136,10 +178,10 @@ def test_a_folder_whose_run_was_killed_at_once_is_taken(config):
 
 
 UNFINISHED = (
-    *(".seeds.parquet.partial", ".tables.json.partial", "demonstrations/pool.npz.partial"),
-    "policies/ddpg.orbax-checkpoint-tmp-0/file",
+    *(".seeds.parquet.partial", ".demonstrations.partial/pool.npz.partial"),
+    "cells/.ddpg-seeds-0-99.partial/policies/file",
 )
-SOMEBODYS = (".notes.partial", "downloads/film.partial", "policies/mine", "notes.txt")
+SOMEBODYS = (".notes.partial", "downloads/film.partial", "cells/mine", "notes.txt")
 
 
 def write(folder, names):
@@ -157,8 +199,8 @@ def test_what_a_killed_run_left_is_removed_and_nothing_else(config):
 
 
 def refused_at_work(config, names):
-    with run_folder.opened(config) as folder:
-        write(folder, names)
+    with opening(config):
+        write(config.folder, names)
         raise UserError("no expert")
 
 
@@ -177,13 +219,33 @@ def test_a_refusal_at_work_leaves_what_somebody_else_put_there(config):
     assert {path.name for path in contents(config.folder)} == {"notes.txt"}
 
 
-def test_a_damaged_table_is_refused_before_anything_is_removed(config):
+def test_a_refusal_at_work_keeps_the_cells_that_are_finished(config):
     opened(config)
-    write(config.folder, (*UNFINISHED, "seeds.parquet"))
+    cells_of.save(config.folder, CellKey(0, "none", "ddpg", 0, 0, 2))
+    with pytest.raises(UserError, match="no expert"):
+        refused_at_work(config, ("demonstrations/pool.npz",))
+    assert len(cells.finished(config.folder)) == 1
+    assert (config.folder / "demonstrations" / "pool.npz").exists()
+
+
+def test_a_damaged_cell_is_refused_before_anything_is_removed(config):
+    opened(config)
+    path = cells_of.save(config.folder, CellKey(0, "none", "ddpg", 0, 0, 2))
+    (path / "seeds.parquet").unlink()
+    write(config.folder, UNFINISHED)
     before = contents(config.folder)
-    with pytest.raises(UserError, match="damaged table"):
+    with pytest.raises(UserError, match=r"is damaged \(seeds\.parquet\)"):
         opened(config)
     assert contents(config.folder) == before
+
+
+def test_checkpoints_of_finished_cells_go_and_others_stay(config):
+    folder = opened(config)
+    write(folder, ("checkpoints/ddpg-seeds-0-1/250/file", "checkpoints/bc-n5-seeds-0-1/250/file"))
+    run_folder.remove_checkpoints(folder, ["ddpg-seeds-0-1"])
+    assert [path.name for path in (folder / "checkpoints").iterdir()] == ["bc-n5-seeds-0-1"]
+    run_folder.remove_checkpoints(folder, ["bc-n5-seeds-0-1"])
+    assert not (folder / "checkpoints").exists()
 
 
 @pytest.mark.parametrize("name", run_folder.FOLDERS)
@@ -213,6 +275,7 @@ def whole(tmp_path_factory):
 @given(damage=damages.damages())
 def test_a_damaged_configuration_is_a_users_error_or_harmless(whole, damage):
     with damages.done_to(whole.folder / "config.json", damage):
-        _, refusal = damages.attempt(UserError, run_folder.check, whole)
+        described = validation.describe(whole)
+        _, refusal = damages.attempt(UserError, run_folder.check, whole.folder, described)
     assert refusal is None or refusal.startswith("--out: ")
     assert "\n" not in str(refusal)

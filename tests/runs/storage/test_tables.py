@@ -1,14 +1,16 @@
 import numpy as np
 import polars as pl
 import pytest
+from polars.testing import assert_frame_equal
 
 from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.gymnasium_replay import Replay
 from cmedirl_jax.runs.cells.record import EpisodeRows, EvaluationRows, Means
 from cmedirl_jax.runs.storage import tables
+from cmedirl_jax.runs.storage.cells import CellKey
 from cmedirl_jax.training.evaluation import Evaluation
 
-LABELS = {"expert": pl.String, "method": pl.String, "n_demos": pl.Int32}
+LABELS = {"study": pl.Int64, "expert": pl.String, "method": pl.String, "n_demos": pl.Int32}
 SCHEMAS = {
     "evaluations": {
         "protocol": pl.String,
@@ -47,7 +49,7 @@ def evaluation(protocol, env_step, *seeds):
     )
 
 
-def rows(episodes):
+def rows(episodes, first_seed=0):
     result = CellResult(
         evaluations=[
             evaluation("steps", 0, 0, 1, 2),
@@ -64,7 +66,7 @@ def rows(episodes):
     )
     return tables.rows(
         result,
-        {"expert": "best", "method": "hs-ddpg", "n_demos": 10},
+        CellKey(7, "best", "hs-ddpg", 10, first_seed, 3),
         best_return=np.array([93.0, 94.0, 95.0]),
         replay=Replay(
             np.array([[1.0, 2.0, 3.0]] * 3), np.array([[1, 2, 3], [1, 2.5, 2.75], [0, 2, 3]])
@@ -73,18 +75,26 @@ def rows(episodes):
     )
 
 
+EPISODES = EpisodeRows(
+    seed=np.array([2, 0, 0]),
+    episode=np.array([1, 1, 2]),
+    env_step=np.array([90, 80, 160]),
+    episode_return=np.array([91.0, 92.0, -3.0]),
+    length=np.array([90, 80, 80]),
+    terminated=np.array([True, True, False]),
+)
+
+
 @pytest.fixture(scope="module")
 def found():
-    return rows(
-        EpisodeRows(
-            seed=np.array([2, 0, 0]),
-            episode=np.array([1, 1, 2]),
-            env_step=np.array([90, 80, 160]),
-            episode_return=np.array([91.0, 92.0, -3.0]),
-            length=np.array([90, 80, 80]),
-            terminated=np.array([True, True, False]),
-        )
-    )
+    return rows(EPISODES)
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_a_later_block_has_the_same_rows_of_later_seeds(found, name):
+    later = rows(EPISODES, first_seed=100)[name]
+    assert_frame_equal(later.with_columns(pl.col("seed") - 100), found[name])
+    assert later["seed"].min() >= 100
 
 
 @pytest.mark.parametrize("name", SCHEMAS)
@@ -101,7 +111,7 @@ def test_a_cell_without_episodes_has_the_same_columns(found, name):
 @pytest.mark.parametrize("name", SCHEMAS)
 def test_every_row_names_its_cell(found, name):
     labels = found[name].select(*LABELS).unique()
-    assert labels.rows() == [("best", "hs-ddpg", 10)]
+    assert labels.rows() == [(7, "best", "hs-ddpg", 10)]
 
 
 def test_evaluations_are_in_order_of_seed_and_step(found):

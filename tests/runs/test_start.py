@@ -5,15 +5,15 @@ import sys
 
 import pytest
 
-from cmedirl_jax.runs import heap
+from cmedirl_jax.runs import start
 
 # Eight threads that allocate at the same time, each from the arena that it was given.
 SCRIPT = """
 import ctypes, re, sys, tempfile, threading
-from cmedirl_jax.runs import heap
+from cmedirl_jax.runs import start
 
 if sys.argv[1:]:
-    heap.share(arenas=int(sys.argv[1]))
+    start.share_heap(arenas=int(sys.argv[1]))
 libc = ctypes.CDLL(None)
 libc.malloc.restype = ctypes.c_void_p
 libc.fdopen.restype = ctypes.c_void_p
@@ -64,6 +64,6 @@ def test_what_the_user_says_stays():
 @pytest.mark.parametrize("system", ["linux", "darwin"])
 def test_another_c_library_is_left_alone(system, monkeypatch):
     monkeypatch.delenv("MALLOC_ARENA_MAX", raising=False)
-    monkeypatch.setattr(heap.sys, "platform", system)
-    monkeypatch.setattr(heap.ctypes, "CDLL", lambda _: object())
-    heap.share(arenas=2)
+    monkeypatch.setattr(start.sys, "platform", system)
+    monkeypatch.setattr(start.ctypes, "CDLL", lambda _: object())
+    start.share_heap(arenas=2)

@@ -6,20 +6,19 @@ import sys
 import time
 
 import chex
-import numpy as np
 import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import checkpoint
-from cmedirl_jax.runs.cluster import exchange, orbax_worker, processes
-from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.storage import sealing
+from cmedirl_jax.runs.cluster import processes
+from cmedirl_jax.runs.storage import tables
 from experiments import run_grid
 from tests.support import ROOT, pools
 
 PROCESSES = 2
+FIRST_CELL = "cells/me-ddpg-n1-seeds-0-8"
 TINY = (
     # Two cells that share their programs.
     *("--methods", "me-ddpg", "--n-demos", 1, 2, "--seeds", 9, "--max-steps", 300),
@@ -55,26 +54,6 @@ TINY = (
 def test_options_that_contradict_each_other_are_refused(capsys, arguments, line):
     assert run_grid.main(arguments.split()) == 2
     assert capsys.readouterr().err == f"run_grid: {line}\n"
-
-
-def test_one_process_speaks_to_itself():
-    pool = pools.scripted(2)
-    value = {"cells": [["ddpg", 0]], "seed": 1}
-    assert exchange.is_writer()
-    assert exchange.from_writer(lambda: value) == value
-    assert exchange.pool_from_writer(lambda: pool) is pool
-    assert exchange.pool_from_writer(lambda: None) is None
-    assert orbax_worker.call(max, 1, 2) == 2
-    assert not exchange.any_process(False)
-    np.testing.assert_array_equal(exchange.arrays_from_writer([np.arange(3)]), [[0, 1, 2]])
-
-
-def test_what_the_writer_refuses_is_raised():
-    def refuse():
-        raise UserError("--out: no")
-
-    with pytest.raises(UserError, match="--out: no"):
-        exchange.from_writer(refuse)
 
 
 def test_a_port_is_free_again_at_once_when_a_run_has_ended():
@@ -197,8 +176,8 @@ def wait_for(run, condition, seconds=120):
 
 
 def assert_same_tables(folder, expected):
-    for name in sealing.TABLES:
-        found, wanted = (pl.read_parquet(path / f"{name}.parquet") for path in (folder, expected))
+    for name in tables.FILES:
+        found, wanted = (pl.read_parquet(path / name) for path in (folder, expected))
         assert_frame_equal(found, wanted, rel_tol=1e-3, abs_tol=1e-3)
 
 
@@ -215,8 +194,8 @@ def test_stopped_together_or_bereaved_they_go_on_to_what_one_process_gives(
             assert "run_grid: stopped by SIGTERM" in run.output(index).splitlines()[-1]
 
     with together() as run:
-        wait_for(run, (folder / "evaluations.parquet").exists)
-        assert "me-ddpg-n1 goes on from its checkpoint" in run.output(0)
+        wait_for(run, (folder / FIRST_CELL).exists)
+        assert "me-ddpg-n1-seeds-0-8 goes on from its checkpoint" in run.output(0)
         # The first cell is finished; it dies in the second.
         run.running[1].kill()
         assert run.codes(60) == [1, -signal.SIGKILL]
@@ -232,7 +211,7 @@ def test_stopped_together_or_bereaved_they_go_on_to_what_one_process_gives(
         assert said == []
     assert not (tmp_path / "run-1").exists()
     assert_same_tables(folder, alone)
-    found, wanted = (checkpoint.load(path / "policies" / "me-ddpg-n1") for path in (folder, alone))
+    found, wanted = (checkpoint.load(path / FIRST_CELL / "policies") for path in (folder, alone))
     chex.assert_trees_all_close(found, wanted, rtol=1e-3, atol=1e-3)
 
 

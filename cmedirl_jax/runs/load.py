@@ -1,0 +1,169 @@
+"""A run's policies and rewards as plain functions.
+
+act = load_policy("results/tuned", "hs-me-ddpg", seed=3)
+action = act(observation)
+r_d = load_reward("results/tuned", "hs-me-ddpg", seed=3)
+value = r_d(observation, action)
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from cmedirl_jax import envs, networks
+from cmedirl_jax.io import checkpoint
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import cells
+from cmedirl_jax.runs.storage.cells import SavedCell
+from cmedirl_jax.tabular import discretise, imitation, table_reward
+from cmedirl_jax.training import compose
+from cmedirl_jax.training.methods import METHODS, Method
+from cmedirl_jax.training.settings import Settings
+from cmedirl_jax.types import EnvSpec
+
+
+class _Learned(NamedTuple):
+    """A cell, and the task, method and settings of its policies and rewards."""
+
+    cell: SavedCell
+    task: EnvSpec
+    method: Method
+    settings: Settings
+
+    @property
+    def only_tables(self) -> bool:
+        """Whether the method has no networks: its policies and rewards are tables on a grid."""
+        return self.method.tabular is not None and not self.method.interacts
+
+    def parameters(self, name: str, one: Any, seed: int) -> Any:
+        """One seed's parameters, of the folder `name`; `one` has their structure and shapes."""
+        key = self.cell.key
+
+        def of_cell(leaf: Any) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct((key.seeds, *leaf.shape), leaf.dtype)
+
+        every = checkpoint.load(self.cell.path / name, jax.tree.map(of_cell, one))
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[seed - key.first_seed]), every)
+
+
+def load_policy(
+    run: str | Path, method: str, seed: int, n_demos: int | None = None, study: int | None = None
+) -> Callable[[Any], jax.Array]:
+    """A seed's best policy, without exploration noise.
+
+    Args:
+        run: the run's folder.
+        method: the method's name.
+        seed: which learner.
+        n_demos: demonstrations of the learner, where the run has several numbers of them.
+        study: the study's seed, where the run has several.
+
+    Returns:
+        `observation [..., O] -> action [..., A]`, not compiled.
+
+    Raises:
+        ValueError: if the run has no such cell or several, saying which there are; or if a file is
+            damaged or of another version.
+        OSError: if a file cannot be read.
+    """
+    learned = _find(run, method, seed, n_demos, study)
+    task, settings = learned.task, learned.settings
+    if learned.only_tables:
+        env = envs.make(task.id)
+        # Only the grids of the discretised task are needed, which no computation gives.
+        mdp = jax.eval_shape(lambda: imitation.discretised(env, settings.tabular))
+        table = learned.parameters("policies", mdp.reward, seed)
+        return discretise.greedy(mdp, table)
+    made = networks.make(task, settings.architecture)
+    actor = learned.parameters("policies", _abstract(made.actor.init), seed)
+    return lambda observation: networks.policy(made, actor, jnp.asarray(observation))
+
+
+def load_reward(
+    run: str | Path, method: str, seed: int, n_demos: int | None = None, study: int | None = None
+) -> Callable[[Any, Any], jax.Array]:
+    """A seed's reward r_D at the end of its training: bounded, and with its gauge's offset.
+
+    The reward of `maxent-irl` and `deep-maxent-irl` is interpolated on their grid.
+
+    Args:
+        run: the run's folder.
+        method: the method's name.
+        seed: which learner.
+        n_demos: demonstrations of the learner, where the run has several numbers of them.
+        study: the study's seed, where the run has several.
+
+    Returns:
+        `(observation [..., O], action [..., A]) -> [...]`, not compiled.
+
+    Raises:
+        ValueError: as `load_policy`; and if the method has no reward of its own.
+        OSError: if a file cannot be read.
+    """
+    learned = _find(run, method, seed, n_demos, study)
+    task, settings = learned.task, learned.settings
+    if not (learned.cell.path / "rewards").exists():
+        raise ValueError(f"{run}: {method} learns no reward")
+    if learned.only_tables:
+        states, actions = imitation.grids(task, settings.tabular)
+        learner = table_reward.make(states, actions, settings.reward)
+        # The last row is the absorbing state's, which no observation is in.
+        whole = jax.ShapeDtypeStruct((states.size + 1, actions.size), jnp.float32)
+        params = learned.parameters("rewards", whole, seed)[:-1]
+    else:
+        made = compose.compose(task, learned.method, settings, task.max_episode_steps)
+        assert made.learner is not None
+        learner = made.learner
+        params = learned.parameters("rewards", _abstract(learner.init).params, seed)
+    state = learner.init(jax.random.key(0)).replace(params=params)
+    return lambda observation, action: learner.reward(
+        state, jnp.asarray(observation), jnp.asarray(action)
+    )
+
+
+def _abstract(init: Callable[[jax.Array], Any]) -> Any:
+    """The structure and shapes of the parameters that `init` draws."""
+    return jax.eval_shape(lambda: init(jax.random.key(0)))
+
+
+def _find(
+    run: str | Path, method: str, seed: int, n_demos: int | None, study: int | None
+) -> _Learned:
+    try:
+        finished = cells.finished(Path(run))
+    except UserError as error:
+        raise ValueError(str(error)) from error
+    if not finished:
+        raise ValueError(f"{run}: holds no finished cell of a run")
+
+    def matches(cell: SavedCell) -> bool:
+        key = cell.key
+        return (
+            key.method == method
+            and seed in key.seed_range
+            and n_demos in (None, key.n_demos)
+            and study in (None, key.study)
+        )
+
+    matching = [cell for cell in finished if matches(cell)]
+    if not matching:
+        there = "; ".join(str(cell.key) for cell in finished)
+        asked = _words(method=method, seed=seed, n_demos=n_demos, study=study)
+        raise ValueError(f"{run}: holds no {asked}; there are: {there}")
+    if len(matching) > 1:
+        choices = "; ".join(
+            _words(n_demos=cell.key.n_demos, study=cell.key.study) for cell in matching
+        )
+        raise ValueError(f"{run}: holds several of {method}, seed {seed}; give one of: {choices}")
+    (cell,) = matching
+    try:
+        return _Learned(cell, cell.task(), METHODS[method], cell.settings())
+    except (LookupError, ValueError, TypeError) as error:
+        raise ValueError(f"{cell.path}: {error}") from error
+
+
+def _words(**values: Any) -> str:
+    return ", ".join(f"{name} {value}" for name, value in values.items() if value is not None)

@@ -1,0 +1,284 @@
+"""Training the cells of a run, and the experts whose demonstrations they use."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from cmedirl_jax.agents import hot_start
+from cmedirl_jax.agents.hot_start import HotStartData
+from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.runs.cells import cell as cell_lib
+from cmedirl_jax.runs.cells import compiled as compiled_lib
+from cmedirl_jax.runs.cells import experts, gymnasium_replay, tabular_cell
+from cmedirl_jax.runs.cells.cell import CellResult
+from cmedirl_jax.runs.cells.compiled import CompiledMethod
+from cmedirl_jax.runs.cells.evaluator import Evaluator
+from cmedirl_jax.runs.cluster.base import Cluster
+from cmedirl_jax.runs.console.progress import Reporter, reporter
+from cmedirl_jax.runs.console.signals import Interruption
+from cmedirl_jax.runs.storage import cells, checkpoints, plain, tables
+from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
+from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.runs.storage.cells import CellKey
+from cmedirl_jax.runs.storage.checkpoints import Checkpointer
+from cmedirl_jax.runs.validation import Plan
+from cmedirl_jax.training.methods import METHODS, Method
+from cmedirl_jax.training.settings import Settings
+
+EXPERTS = "experts"
+"""The name of the experts' checkpoints."""
+FRESH_STARTS = 100
+"""Random start states on which each seed's best policy is evaluated at the end."""
+
+
+class Keys(NamedTuple):
+    """Independent randomness, all from the study's seed. Methods share it: seeds are paired."""
+
+    learners: jax.Array
+    experts: jax.Array
+    fresh_starts: jax.Array
+
+
+class Cell(NamedTuple):
+    """A cell to be trained: a method, a number of demonstrations, a block of seeds."""
+
+    method: Method
+    n_demos: int
+    block: range
+
+    @property
+    def name(self) -> str:
+        """The name of its folder."""
+        return cells.name(self.method.name, self.n_demos, self.block.start, len(self.block))
+
+    @property
+    def title(self) -> str:
+        """Its name in the progress."""
+        seeds = f"{len(self.block)} seeds"
+        if self.block.start:
+            seeds = f"seeds {self.block.start} to {self.block.stop - 1}"
+        return f"{cells.stem(self.method.name, self.n_demos)}, {seeds}"
+
+
+class _Pool(NamedTuple):
+    """The demonstrations as cells use them.
+
+    Attributes:
+        data: for the learners; None if no cell needs any.
+        metadata: of the pool.
+    """
+
+    data: HotStartData | None
+    metadata: dict[str, Any]
+
+
+class Session(NamedTuple):
+    """The plan and the means of a run, which its cells share."""
+
+    plan: Plan
+    keys: Keys
+    console: Console
+    interruption: Interruption
+    cluster: Cluster
+    compiled: Callable[[Method, Settings, int], CompiledMethod]
+    compiled_fit: Callable[[Method], tabular_cell.CompiledFit]
+
+    def checkpointer(self, name: str) -> Checkpointer:
+        """Saves the training that is called `name`."""
+        say = functools.partial(self.console.print, markup=False, highlight=False, soft_wrap=True)
+        return Checkpointer(
+            self.plan.folder / checkpoints.FOLDER / name,
+            {"cell": name, **run_folder.identity(self.plan.config)},
+            every=self.plan.checkpoint_every,
+            interruption=self.interruption,
+            say=say,
+            cluster=self.cluster,
+        )
+
+
+def session_of(
+    plan: Plan,
+    devices: Sequence[Any],
+    console: Console,
+    interruption: Interruption,
+    cluster: Cluster,
+) -> Session:
+    """The session of a run; its programs are compiled at their first use."""
+    return Session(
+        plan,
+        Keys(*jax.random.split(jax.random.key(plan.study), 3)),
+        console,
+        interruption,
+        cluster,
+        compiled_lib.compiler(
+            plan.env,
+            devices,
+            capacity=plan.capacity,
+            subset_size=plan.subset_size,
+            least_slots=0 if plan.demos is not None else plan.experts.seeds,
+            group=plan.group,
+            gather=cluster.gather,
+        ),
+        functools.cache(
+            functools.partial(
+                tabular_cell.compile_method,
+                plan.env,
+                settings=plan.settings,
+                devices=devices,
+                subset_size=plan.subset_size,
+                gather=cluster.gather,
+            )
+        ),
+    )
+
+
+def train_cells(session: Session, todo: Sequence[Cell]) -> None:
+    """Make the demonstrations if they are missing, and train the cells, with live progress."""
+    plan, cluster = session.plan, session.cluster
+
+    def load_stored() -> Demonstrations | None:
+        with run_folder.naming_the_option():
+            return stored_demonstrations.load(plan.folder, plan.env.spec)
+
+    # The demonstrations, and how many steps there are to train.
+    stored = cluster.pool_from_writer(load_stored)
+    pool = stored if plan.demos is None else plan.demos
+    trains_experts = pool is None and any(cell.n_demos for cell in todo)
+    if pool is not None:
+        plan.check_enough(pool)
+    steps = sum(len(cell.block) * plan.budget.max_steps for cell in todo if cell.method.interacts)
+    steps += plan.experts.seeds * plan.experts.steps * trains_experts
+
+    # Experts if they are needed, then the cells.
+    with reporter(session.console, len(todo) + trains_experts, steps) as report:
+        if trains_experts:
+            report.start(f"experts, {plan.experts.seeds} seeds")
+            with session.checkpointer(EXPERTS) as checkpointer:
+                pool = _train_experts(session, checkpointer, report)
+            plan.check_enough(pool)
+        if pool is not None and stored is None and cluster.writer:
+            stored_demonstrations.save(plan.folder, pool)
+        if pool is not None and cluster.writer:
+            run_folder.remove_checkpoints(plan.folder, [EXPERTS])
+        used = _Pool(None, {})
+        if pool is not None:
+            agent = plan.settings.agent
+            data = hot_start.data(pool, agent.discount, agent.reward_scale)
+            used = _Pool(data, pool.metadata)
+        for cell in todo:
+            if session.interruption.came():
+                session.interruption.stop()
+            report.start(cell.title)
+            with session.checkpointer(cell.name) as checkpointer:
+                _train_cell(session, checkpointer, cell, used, report)
+
+
+def _train_experts(
+    session: Session, checkpointer: Checkpointer, report: Reporter
+) -> Demonstrations:
+    plan = session.plan
+    return experts.make_pool(
+        session.keys.experts,
+        plan.env,
+        plan.experts,
+        plan.expert,
+        session.compiled(METHODS["ddpg"], Settings(), plan.seeds),
+        _stepwise(report, plan.experts.seeds),
+        checkpointer,
+        session.cluster,
+    )
+
+
+def _train_cell(
+    session: Session, checkpointer: Checkpointer, cell: Cell, pool: _Pool, report: Reporter
+) -> None:
+    """Train a cell, evaluate its best policies, and save it."""
+    result, evaluator = _train(session, checkpointer, cell, pool, report)
+    plan, fresh_starts = session.plan, session.keys.fresh_starts
+
+    # Evaluate each seed's best policy, in JAX and in Gymnasium.
+    fresh = evaluator.on_fresh_starts(result.best, fresh_starts, FRESH_STARTS)
+    best_return = evaluator.summarise(fresh).return_mean
+    replay = gymnasium_replay.replay(evaluator, result.best, plan.env)
+
+    # Save.
+    metadata: dict[str, Any] = pool.metadata if cell.n_demos else {"expert": "none"}
+    key = CellKey(
+        study=plan.study,
+        expert=metadata.get("expert", "file"),
+        method=cell.method.name,
+        n_demos=cell.n_demos,
+        first_seed=cell.block.start,
+        seeds=len(cell.block),
+    )
+    rows = tables.rows(
+        result,
+        key,
+        best_return=np.asarray(best_return),
+        replay=replay,
+        expert_steps=metadata.get("expert_env_steps", 0),
+    )
+    if session.cluster.writer:
+        checkpointer.wait()
+        description = {
+            "task": plain.plain(plan.env.spec),
+            "settings": plain.plain(plan.settings),
+            "versions": run_folder.versions(),
+        }
+        trees = {"policies": result.best, "rewards": result.reward}
+        cells.save(plan.folder, key, description, rows, trees, session.cluster.call)
+        checkpointer.remove()
+
+
+def _train(
+    session: Session, checkpointer: Checkpointer, cell: Cell, pool: _Pool, report: Reporter
+) -> tuple[CellResult, Evaluator]:
+    """Train a cell; gives its evaluator too."""
+    plan, key, budget = session.plan, session.keys.learners, session.plan.budget
+    seeds = {"seeds_count": len(cell.block), "first_seed": cell.block.start}
+    if cell.method.tabular is not None and not cell.method.interacts:
+        fit = session.compiled_fit(cell.method)
+        assert pool.data is not None
+        result = tabular_cell.train(
+            fit,
+            key,
+            pool.data,
+            cell.n_demos,
+            **seeds,
+            evaluation_starts=budget.evaluation_starts,
+            checkpointer=checkpointer,
+        )
+        return result, fit.evaluator
+    programs = session.compiled(cell.method, plan.settings, len(cell.block))
+    result = cell_lib.train(
+        programs,
+        key,
+        pool.data if cell.n_demos else None,
+        cell.n_demos,
+        **seeds,
+        budget=budget if cell.method.interacts else dataclasses.replace(budget, max_steps=0),
+        threshold=plan.env.spec.reward_threshold,
+        report=_stepwise(report, len(cell.block)),
+        checkpointer=checkpointer,
+    )
+    return result, programs.evaluator
+
+
+def _stepwise(report: Reporter, seeds_count: int) -> Callable[[cell_lib.Progress], None]:
+    """Report a cell's progress, which counts from its first step, as increments."""
+    before: int | None = None
+
+    def advance(progress: cell_lib.Progress) -> None:
+        nonlocal before
+        if before is None:
+            report.go_on(progress.env_step * seeds_count)
+        else:
+            report.advance((progress.env_step - before) * seeds_count, progress.solved_fraction)
+        before = progress.env_step
+
+    return advance
