@@ -1,9 +1,12 @@
+import ctypes
+import gc
 import os
 
 import hypothesis
 import jax
 import numpy as np
 import platformdirs
+import psutil
 import pytest
 
 from cmedirl_jax import envs
@@ -14,9 +17,44 @@ from tests.support import compiling
 hypothesis.settings.register_profile("reproducible", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("reproducible")
 
+MOST_MEMORY = 10**9
+"""Resident bytes of a process above which compiled programs are freed between modules."""
+
+
+# The files that take longest, longest first: started last, one would keep a worker alone at the end.
+LONGEST = (
+    "experiments/test_run_grid.py",
+    "end_to_end/test_faults.py",
+    "runs/cluster/test_together.py",
+    "training/test_trainer.py",
+    "agents/test_ddpg.py",
+    "end_to_end/test_refusals.py",
+    "benchmarks/test_benchmarks.py",
+)
+
 
 def pytest_configure():
     compiling.be_quick()
+
+
+def pytest_collection_modifyitems(items):
+    def place(item):
+        name = item.path.relative_to(item.config.rootpath / "tests").as_posix()
+        return LONGEST.index(name) if name in LONGEST else len(LONGEST)
+
+    items.sort(key=place)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def bounded_memory():
+    """What a module has compiled is freed at its end, if the process has grown large by then."""
+    yield
+    if psutil.Process().memory_info().rss > MOST_MEMORY:
+        jax.clear_caches()
+        gc.collect()
+        # The C library keeps what is freed until it is told to give it back.
+        if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+            trim(0)
 
 
 @pytest.fixture(autouse=True, scope="session")
