@@ -21,7 +21,7 @@ MOST_MEMORY = 10**9
 """Resident bytes of a process above which compiled programs are freed between modules."""
 
 
-# The files that take longest, longest first: started last, one would keep a worker alone at the end.
+# Longest first: one of these files started last would keep a worker alone at the end.
 LONGEST = (
     "experiments/test_run_grid.py",
     "end_to_end/test_faults.py",
