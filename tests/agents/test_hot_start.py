@@ -160,17 +160,3 @@ def test_a_pool_can_be_passed_as_it_is():
     direct = hot_start.fit(jax.random.key(2), SMALL, params, pool, hparams)
     prepared = hot_start.fit(jax.random.key(2), SMALL, params, hot_start.data(pool, 0.99), hparams)
     chex.assert_trees_all_equal(direct, prepared)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"discount": 2.0}, "discount must be between 0 and 1, got 2.0"),
-        ({"discount": float("nan")}, "discount must be between 0 and 1, got nan"),
-        ({"reward_scale": -1.0}, "reward_scale must be positive and finite, got -1.0"),
-        ({"reward_scale": float("inf")}, "reward_scale must be positive and finite, got inf"),
-    ],
-)
-def test_impossible_discounts_and_scales_are_refused(given, message):
-    with pytest.raises(ValueError, match=message):
-        hot_start.data(pools.scripted(2), **given)
