@@ -130,18 +130,14 @@ def learn(
     transition = Transition(
         state.observation, behaviour.action, answer.reward, answer.observation, answer.terminated
     )
-    add = parts.algorithm.replay.add
-    replay_state = add(ReplayState(state.storage, plan.step), transition)
+    replay_state = parts.algorithm.replay.add(ReplayState(state.storage, plan.step), transition)
 
     # Learn the reward.
     reward, sampler, reward_info = _learn_reward(
         parts, state, behaviour, ended, replay_state, draws, plan, pool
     )
     if parts.updates.stores_shaped:
-        # Algorithm 2: the reward learns first, then r* is stored. The same row is written over.
-        discount = state.agent.hparams.discount
-        shaped = updates.shape(parts.updates, reward, transition, discount, plan.reward_weight)
-        replay_state = add(ReplayState(replay_state.storage, plan.step), shaped)
+        replay_state = _store_shaped(parts, state, reward, transition, replay_state, plan)
 
     # Learn the agent.
     agent, losses = _learn_agent(parts, state.agent, reward, replay_state, draws, plan, pool)
@@ -190,6 +186,20 @@ def _learn_reward(
         state.reward,
     )
     return reward, sampler_state, info
+
+
+def _store_shaped(
+    parts: StepParts,
+    state: TrainingState,
+    reward: RewardState | None,
+    transition: Transition,
+    replay_state: ReplayState,
+    plan: Plan,
+) -> ReplayState:
+    """Write r* over the r_e that was just stored; Algorithm 2 learns the reward first."""
+    discount = state.agent.hparams.discount
+    shaped = updates.shape(parts.updates, reward, transition, discount, plan.reward_weight)
+    return parts.algorithm.replay.add(ReplayState(replay_state.storage, plan.step), shaped)
 
 
 def _learn_agent(

@@ -108,14 +108,10 @@ def make(
     plan = functools.partial(
         schedules.plan, schedule=settings.schedule, reward_schedule=settings.reward_schedule
     )
-    parts = StepParts(
-        algorithm,
-        updates.make_parts(algorithm, method, settings),
-        env.spec.max_episode_steps,
-    )
-    if method.interacts:
-        run = functools.partial(_run, parts, env, env_params, plan)
-    else:
+    update_parts = updates.make_parts(algorithm, method, settings)
+    parts = StepParts(algorithm, update_parts, env.spec.max_episode_steps)
+    run = functools.partial(_run, parts, env, env_params, plan)
+    if not method.interacts:
         run = functools.partial(_refuse_to_run, method.name)
     return Trainer(
         algorithm=algorithm,
