@@ -19,8 +19,7 @@ hypothesis.settings.register_profile("reproducible", deadline=None, derandomize=
 hypothesis.settings.load_profile("reproducible")
 
 MOST_MEMORY = 7 * 10**8
-"""Resident bytes of a process above which compiled programs are freed between modules."""
-
+"""Resident bytes of a process above which compiled programs are freed between tests."""
 
 # Longest first: one of these files started last would keep a worker alone at the end.
 LONGEST = (
@@ -36,6 +35,9 @@ LONGEST = (
 
 def pytest_configure():
     compiling.be_quick()
+    # A shell's background jobs ignore SIGINT, and so do the commands that they start.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     # A shell starts its background jobs with SIGINT ignored, which tests of signals cannot be.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -49,9 +51,15 @@ def pytest_collection_modifyitems(items):
     items.sort(key=place)
 
 
-@pytest.fixture(autouse=True, scope="module")
+def pytest_collection_finish():
+    # Modules stay until the end: the collector need not look through them again and again.
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(autouse=True)
 def bounded_memory():
-    """What a module has compiled is freed at its end, if the process has grown large by then."""
+    """Compiled programs are freed after a test by whose end the process has grown large."""
     yield
     if psutil.Process().memory_info().rss > MOST_MEMORY:
         jax.clear_caches()
@@ -111,3 +119,9 @@ def compiled(tmp_path_factory):
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {compiling.QUICK_COMMANDS}",
     }
+
+
+@pytest.fixture(scope="module")
+def unoptimised(compiled):
+    """The same for commands that train for a moment, and would compile for longer."""
+    return compiled | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from benchmarks.serving import Worker
 from benchmarks.workload import Workload
 from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import checkpoints
 from cmedirl_jax.training.methods import PAPER_METHODS
 from tests.support import pools
 
@@ -311,13 +313,19 @@ def test_a_process_of_the_scaling_benchmark_times_its_turns():
 
 @pytest.fixture
 def fake_training(monkeypatch):
-    """A cell of ten chunks, a hundredth of a second each."""
-
+    """A cell of ten chunks, a hundredth of a second each by the clock that says what is due."""
     weight = np.random.default_rng(0).random(1_000)
+    clock = types.SimpleNamespace(now=0.0)
+    fake_time = types.SimpleNamespace(
+        monotonic=lambda: clock.now, perf_counter=time.perf_counter, sleep=time.sleep
+    )
+    for module in (checkpoint_cost, checkpoints):
+        monkeypatch.setattr(module, "time", fake_time)
 
     def train(*_, checkpointer, **__):
         for step in range(10):
             time.sleep(0.01)
+            clock.now += 0.01
             if checkpointer is not None:
                 checkpointer.save_if_due(step, lambda: ({"weight": weight}, {"step": np.ones(1)}))
 
@@ -325,12 +333,12 @@ def fake_training(monkeypatch):
 
 
 def test_checkpoints_are_counted_and_their_cost_is_of_the_time_without(fake_training):
-    options = checkpoint_cost.Options(every=0.03, rounds=3)
+    options = checkpoint_cost.Options(every=0.025, rounds=3)
     costs = checkpoint_cost.measure(options, compiled=None)
-    assert 3 <= costs["checkpoints"] <= 3 * 4
+    assert costs["checkpoints"] == 3 * 4
     assert 8_000 <= costs["checkpoint_bytes"] < 20_000
     assert costs["cost_low"] <= costs["cost"] <= costs["cost_high"]
-    assert costs["cost_by_default"] == pytest.approx(costs["cost"] * 0.03 / 60)
+    assert costs["cost_by_default"] == pytest.approx(costs["cost"] * 0.025 / 60)
     assert costs["blocked_seconds"] > 0.0
 
 

@@ -447,12 +447,12 @@ def test_fewer_cells_are_shown_without_training_and_all_again(smoke, main, monke
         assert (folder / name).read_bytes() == (smoke[0] / name).read_bytes()
 
 
-def test_more_methods_numbers_and_seeds_train_what_is_missing(smoke, compiled, tmp_path):
+def test_more_methods_numbers_and_seeds_train_what_is_missing(smoke, unoptimised, tmp_path):
     """The numbers of a cell do not depend on the cells beside it."""
     folder = shutil.copytree(smoke[0], tmp_path / "run")
     kept = snapshot(folder / "cells")
     more = ("--methods", "ddpg", "me-ddpg", "--n-demos", 5, 9, "--seeds", 12)
-    done = run_command(*SMOKE, *more, "--out", folder, **compiled)
+    done = run_command(*SMOKE, *more, "--out", folder, **unoptimised)
     assert done.returncode == 0, done.stderr
     titles = [line for line in done.stdout.splitlines() if line.startswith("[") and "%" not in line]
     assert titles == [
@@ -473,7 +473,7 @@ def test_more_methods_numbers_and_seeds_train_what_is_missing(smoke, compiled, t
     done = run_command(
         *(*SMOKE, "--methods", "me-ddpg", "--n-demos", 5, "--seeds", 12),
         *("--demos", pool, "--out", alone),
-        **compiled,
+        **unoptimised,
     )
     assert done.returncode == 0, done.stderr
     of_cell = (pl.col("method") == "me-ddpg") & (pl.col("n_demos") == 5)
@@ -558,13 +558,13 @@ def test_a_run_cut_off_between_cells_resumes_to_the_same_tables(smoke, compiled,
 
 
 @pytest.mark.skipif(start.cores() < 2, reason="there is one core")
-def test_seeds_do_not_depend_on_the_devices_that_share_them(tmp_path, compiled):
+def test_seeds_do_not_depend_on_the_devices_that_share_them(tmp_path, unoptimised):
     returns = []
     for devices in (1, 2):
         out = tmp_path / str(devices)
         size = ("--seeds", 9, "--max-steps", 300, "--architecture.hidden", 8)
         done = run_command(
-            "--methods", "ddpg", *size, "--devices", devices, "--out", out, **compiled
+            "--methods", "ddpg", *size, "--devices", devices, "--out", out, **unoptimised
         )
         assert done.returncode == 0, done.stderr
         assert f"9 seeds per cell on {devices} CPU device(s)" in done.stdout
@@ -573,7 +573,7 @@ def test_seeds_do_not_depend_on_the_devices_that_share_them(tmp_path, compiled):
     np.testing.assert_allclose(*returns, rtol=1e-3, atol=1e-3)
 
 
-def test_methods_with_a_model_run_beside_the_others(compiled, demos, tmp_path):
+def test_methods_with_a_model_run_beside_the_others(unoptimised, demos, tmp_path):
     methods = ("ddpg", "tabular-me-ddpg", "maxent-irl", "deep-maxent-irl")
     tiny = {"states": 9, "actions": 3, "steps": 2, "centres": 3}
     folder = tmp_path / "run"
@@ -581,7 +581,7 @@ def test_methods_with_a_model_run_beside_the_others(compiled, demos, tmp_path):
         *(*SMOKE, "--methods", *methods, "--n-demos", 1, 2, "--demos", demos),
         *("--seeds", 2, "--max-steps", 250, "--out", folder),
         *(part for name, value in tiny.items() for part in (f"--tabular.{name}", value)),
-        **compiled,
+        **unoptimised,
     )
     assert done.returncode == 0, done.stderr
     summary = pl.read_csv(folder / "summary.csv")
@@ -608,14 +608,14 @@ def test_methods_with_a_model_run_beside_the_others(compiled, demos, tmp_path):
     }
 
 
-def test_comparators_and_controls_run_beside_the_others(compiled, demos, tmp_path):
+def test_comparators_and_controls_run_beside_the_others(unoptimised, demos, tmp_path):
     methods = ("bc", "gail", "ddpg-minus-constant", "random-reward")
     folder = tmp_path / "run"
     done = run_command(
         *(*SMOKE, "--methods", *methods, "--n-demos", 2, "--demos", demos),
         *("--seeds", 2, "--max-steps", 250, "--out", folder),
         *("--hot-start.steps", 5, "--gail.form", "logit D"),
-        **compiled,
+        **unoptimised,
     )
     assert done.returncode == 0, done.stderr
     summary = pl.read_csv(folder / "summary.csv")

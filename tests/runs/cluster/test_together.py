@@ -1,4 +1,7 @@
+import contextlib
 import os
+import random
+import re
 import signal
 import socket
 import subprocess
@@ -13,11 +16,14 @@ from polars.testing import assert_frame_equal
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import checkpoint
 from cmedirl_jax.runs.cluster import processes
+from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import tables
 from experiments import run_grid
 from tests.support import ROOT, pools
 
 PROCESSES = 2
+LIMIT = 300.0
+"""Seconds after which a process that should have ended is one that hangs."""
 FIRST_CELL = "cells/me-ddpg-n1-seeds-0-8"
 TINY = (
     # Two cells that share their programs.
@@ -25,6 +31,11 @@ TINY = (
     *("--architecture.hidden", 8, "--reward-network.hidden", 8, "--schedule.batch-size", 8),
     *("--schedule.learning-starts", 10, "--reward-batches.batch-size", 8),
     *("--checkpoint-every", 0),
+)
+# Gloo's threads write the parts of a line one by one, and so between one another.
+GLOO = re.compile(
+    r"\[Gloo\] Rank | is connected to | peer ranks\. |"
+    r"Expected number of connected peer ranks is : |\d+|\n"
 )
 
 
@@ -67,22 +78,25 @@ def test_a_port_is_free_again_at_once_when_a_run_has_ended():
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
-def test_a_port_that_is_taken_is_refused(compiled, tmp_path, host):
+def test_a_port_that_is_taken_is_refused(unoptimised, tmp_path, host):
     with socket.create_server((host, 0)) as listener:
         port = listener.getsockname()[1]
         options = (
             *("--coordinator", f"127.0.0.1:{port}", "--processes", PROCESSES, "--process-id", 0),
             *("--devices", 1, "--out", tmp_path / "run"),
         )
-        with Processes(tmp_path, lambda _: compiled, lambda _: options, count=1) as run:
-            assert run.codes(60) == [2]
+        with Processes(tmp_path, lambda _: unoptimised, lambda _: options, count=1) as run:
+            assert run.codes() == [2]
             assert run.output(0) == f"run_grid: --coordinator: port {port} is in use\n"
 
 
 def free_port():
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return listener.getsockname()[1]
+    """A free port below those that systems give to connections, which come and go meanwhile."""
+    for port in random.sample(range(15_000, 30_000), 100):
+        with contextlib.suppress(UserError):
+            processes._check_port(port)
+            return port
+    raise AssertionError("no port is free")
 
 
 class Processes:
@@ -114,9 +128,9 @@ class Processes:
             process.kill()
             process.wait()
 
-    def codes(self, seconds):
+    def codes(self):
         """Exit codes of all, once they have ended."""
-        until = time.monotonic() + seconds
+        until = time.monotonic() + LIMIT
         return [process.wait(max(until - time.monotonic(), 0.1)) for process in self.running]
 
     def output(self, index):
@@ -131,7 +145,7 @@ def demos(tmp_path_factory):
 
 
 @pytest.fixture
-def together(tmp_path, compiled, demos):
+def together(tmp_path, unoptimised, demos):
     """A function that starts two processes of two devices, each with a folder of its own."""
 
     def start():
@@ -144,31 +158,31 @@ def together(tmp_path, compiled, demos):
                 *("--process-id", index),
             )
 
-        return Processes(tmp_path, lambda _: compiled, of_process)
+        return Processes(tmp_path, lambda _: unoptimised, of_process)
 
     return start
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory, compiled, demos):
+def alone(tmp_path_factory, unoptimised, demos):
     """The folder of the same run on one process with one device."""
     folder = tmp_path_factory.mktemp("alone") / "run"
     command = ("-m", "experiments.run_grid", *TINY, "--demos", demos, "--devices", 1)
     done = subprocess.run(
         [sys.executable, *map(str, command), "--out", str(folder)],
         cwd=ROOT,
-        env=os.environ | compiled,
+        env=os.environ | unoptimised,
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=LIMIT,
     )
     assert done.returncode == 0, done.stderr
     return folder
 
 
-def wait_for(run, condition, seconds=120):
-    until = time.monotonic() + seconds
+def wait_for(run, condition):
+    until = time.monotonic() + LIMIT
     while not condition():
         assert time.monotonic() < until
         assert all(process.poll() is None for process in run.running), run.output(0)
@@ -189,7 +203,7 @@ def test_stopped_together_or_bereaved_they_go_on_to_what_one_process_gives(
         wait_for(run, lambda: "[1/2] me-ddpg-n1" in run.output(0))
         # One is told to stop, all do, where they can go on from.
         run.running[1].send_signal(signal.SIGTERM)
-        assert run.codes(60) == [143, 143], run.output(0) + run.output(1)
+        assert run.codes() == [143, 143], run.output(0) + run.output(1)
         for index in range(PROCESSES):
             assert "run_grid: stopped by SIGTERM" in run.output(index).splitlines()[-1]
 
@@ -198,17 +212,16 @@ def test_stopped_together_or_bereaved_they_go_on_to_what_one_process_gives(
         assert "me-ddpg-n1-seeds-0-8 goes on from its checkpoint" in run.output(0)
         # The first cell is finished; it dies in the second.
         run.running[1].kill()
-        assert run.codes(60) == [1, -signal.SIGKILL]
+        assert run.codes() == [1, -signal.SIGKILL]
         assert run.output(0).splitlines()[-1] == f"run_grid: {processes.GONE}"
         assert "Traceback" not in run.output(0)
     assert not (folder / "summary.csv").exists()
 
     with together() as run:
-        assert run.codes(120) == [0, 0], run.output(0) + run.output(1)
+        assert run.codes() == [0, 0], run.output(0) + run.output(1)
         assert "9 seeds per cell on 4 CPU device(s)" in run.output(0)
         assert "[1/1] me-ddpg-n2" in run.output(0)
-        said = [line for line in run.output(1).splitlines() if not line.startswith("[Gloo]")]
-        assert said == []
+        assert GLOO.sub("", run.output(1)) == ""
     assert not (tmp_path / "run-1").exists()
     assert_same_tables(folder, alone)
     found, wanted = (checkpoint.load(path / FIRST_CELL / "policies") for path in (folder, alone))
@@ -219,11 +232,11 @@ def test_the_death_of_the_writer_ends_the_others_too(together):
     with together() as run:
         wait_for(run, lambda: "[1/2] me-ddpg-n1" in run.output(0))
         run.running[0].kill()
-        assert run.codes(60) == [-signal.SIGKILL, 1]
+        assert run.codes() == [-signal.SIGKILL, 1]
         assert f"run_grid: {processes.GONE}" in run.output(1).splitlines()
 
 
-def test_processes_that_a_cluster_starts_find_each_other_and_refuse_together(compiled, tmp_path):
+def test_processes_that_a_cluster_starts_find_each_other_and_refuse_together(unoptimised, tmp_path):
     cluster = {
         "SLURM_JOB_ID": "1",
         "SLURM_STEP_NODELIST": "127.0.0.1",
@@ -232,13 +245,13 @@ def test_processes_that_a_cluster_starts_find_each_other_and_refuse_together(com
     }
 
     def environment(index):
-        return compiled | cluster | {"SLURM_PROCID": str(index), "SLURM_LOCALID": str(index)}
+        return unoptimised | cluster | {"SLURM_PROCID": str(index), "SLURM_LOCALID": str(index)}
 
     def options(index):
         return ("--distributed", "--devices", 1, "--seeds", 5 + index, "--out", tmp_path / "run")
 
     with Processes(tmp_path, environment, options) as run:
-        assert run.codes(60) == [2, 2]
+        assert run.codes() == [2, 2]
         for index, differ in enumerate(("another process", "seeds")):
             assert run.output(index).splitlines()[-1] == (
                 f"run_grid: --process-id: not all processes were given the same options ({differ})"
@@ -246,7 +259,7 @@ def test_processes_that_a_cluster_starts_find_each_other_and_refuse_together(com
     assert not (tmp_path / "run").exists()
 
 
-def test_a_folder_that_cannot_be_written_is_refused_on_all(compiled, tmp_path):
+def test_a_folder_that_cannot_be_written_is_refused_on_all(unoptimised, tmp_path):
     port = free_port()
     (tmp_path / "file").touch()
 
@@ -256,8 +269,8 @@ def test_a_folder_that_cannot_be_written_is_refused_on_all(compiled, tmp_path):
             *("--process-id", index, "--devices", 1, "--seeds", 9, "--out", tmp_path / "file/run"),
         )
 
-    with Processes(tmp_path, lambda _: compiled, options) as run:
-        assert run.codes(60) == [2, 2]
+    with Processes(tmp_path, lambda _: unoptimised, options) as run:
+        assert run.codes() == [2, 2]
         for index in range(PROCESSES):
             line = run.output(index).splitlines()[-1]
             assert line.startswith("run_grid: --out: cannot write to ")
@@ -266,6 +279,6 @@ def test_a_folder_that_cannot_be_written_is_refused_on_all(compiled, tmp_path):
 def test_without_a_cluster_there_is_nothing_to_join(tmp_path):
     options = ("--distributed", "--devices", 1)
     with Processes(tmp_path, lambda _: {}, lambda _: options, count=1) as run:
-        assert run.codes(60) == [2]
+        assert run.codes() == [2]
         (line,) = run.output(0).splitlines()
         assert line.startswith("run_grid: --distributed: JAX detects no cluster here (")

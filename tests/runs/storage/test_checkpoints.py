@@ -4,7 +4,7 @@ import hashlib
 import os
 import resource
 import shutil
-import time
+import types
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from cmedirl_jax.io import checkpoint
 from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.errors import Interrupted, UserError
-from cmedirl_jax.runs.storage import sealing
+from cmedirl_jax.runs.storage import checkpoints, sealing
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 
 
@@ -109,11 +109,15 @@ def test_a_cell_that_is_finished_keeps_none(kept):
     assert not kept.folder.exists()
 
 
-def test_nothing_is_saved_before_its_time(kept):
-    checkpointer = kept.checkpointer(every=0.2)
+def test_nothing_is_saved_before_its_time(kept, monkeypatch):
+    clock = types.SimpleNamespace(now=0.0)
+    monkeypatch.setattr(checkpoints, "time", types.SimpleNamespace(monotonic=lambda: clock.now))
+    checkpointer = kept.checkpointer(every=60.0)
+    clock.now = 59.0
     checkpointer.save_if_due(1, lambda: pytest.fail("too early"))
-    time.sleep(0.25)
+    clock.now = 61.0
     checkpointer.save_if_due(2, lambda: (state_at(2), record_at(2)))
+    clock.now = 120.0
     checkpointer.save_if_due(3, lambda: pytest.fail("too early again"))
     checkpointer.wait()
     assert kept.names() == ["2"]
