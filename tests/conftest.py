@@ -18,7 +18,7 @@ from tests.support import compiling
 hypothesis.settings.register_profile("reproducible", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("reproducible")
 
-MOST_MEMORY = 7 * 10**8
+MOST_MEMORY = 10**9
 """Resident bytes of a process above which compiled programs are freed between tests."""
 
 # Longest first: one of these files started last would keep a worker alone at the end.
@@ -35,9 +35,6 @@ LONGEST = (
 
 def pytest_configure():
     compiling.be_quick()
-    # A shell's background jobs ignore SIGINT, and so do the commands that they start.
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
     # A shell starts its background jobs with SIGINT ignored, which tests of signals cannot be.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
