@@ -163,7 +163,7 @@ class _Training:
         slot_seed = saved.record.pop("slot_seed")
         state = saved.state["training"]
         if abstract.subset is not None:
-            state = _with_subset(state, abstract.subset.start.shape[1])
+            state = _with_padding(state, abstract.subset.start.shape[1])
         if slot_seed.size == slots.seed.size:
             # Every seed in the slot that it had: elsewhere in its group it might round otherwise.
             slots.seed = slot_seed
@@ -186,7 +186,7 @@ class _Training:
         }
         tree = jax.tree.map(np.array, self.programs.evaluator.gather(tree))
         # Without the padding, whose size depends on the other cells that a command asks for.
-        tree["training"] = _with_subset(tree["training"], self.n_demos)
+        tree["training"] = _without_padding(tree["training"], self.n_demos)
         arrays = {"slot_seed": self.slots.seed.copy(), **self.record.to_arrays()}
         return tree, arrays
 
@@ -264,7 +264,7 @@ def _saved_like(
         )
 
     def untyped(state: TrainingState) -> TrainingState:
-        return _with_subset(jax.tree.map(_untyped, state), n_demos)
+        return _without_padding(jax.tree.map(_untyped, state), n_demos)
 
     state = jax.eval_shape(untyped, abstract)
     return {
@@ -274,16 +274,18 @@ def _saved_like(
     }
 
 
-def _with_subset(state: TrainingState, size: int) -> TrainingState:
-    """The state with its demonstrations padded to `size`, or without as much padding."""
-    if state.subset is None:
-        return state
+def _without_padding(state: TrainingState, n_demos: int) -> TrainingState:
+    """The state with its demonstrations alone, of arrays or of their shapes."""
+    return state.replace(subset=jax.tree.map(lambda leaf: leaf[:, :n_demos], state.subset))
 
-    def resized(leaf: Any) -> Any:
-        leaf = leaf[:, :size]
-        return jnp.pad(leaf, ((0, 0), (0, size - leaf.shape[1])))
 
-    return state.replace(subset=jax.tree.map(resized, state.subset))
+def _with_padding(state: TrainingState, size: int) -> TrainingState:
+    """The state, of numpy arrays, with its demonstrations padded to `size`."""
+
+    def padded(leaf: np.ndarray) -> np.ndarray:
+        return np.pad(leaf, ((0, 0), (0, size - leaf.shape[1])))
+
+    return state.replace(subset=jax.tree.map(padded, state.subset))
 
 
 def _chunk_ends(step: int, budget: Budget) -> Iterator[int]:
