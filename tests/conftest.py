@@ -18,7 +18,7 @@ from tests.support import compiling
 hypothesis.settings.register_profile("reproducible", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("reproducible")
 
-MOST_MEMORY = 10**9
+MOST_MEMORY = 1.4e9
 """Resident bytes of a process above which compiled programs are freed between tests."""
 
 # Longest first: one of these files started last would keep a worker alone at the end.
@@ -69,6 +69,8 @@ def bounded_memory():
 @pytest.fixture(autouse=True, scope="session")
 def no_users_cache(tmp_path_factory):
     """Commands run within the tests' process leave nothing in the user's cache."""
+    # The tests after such a command would look for each of their small programs on the disk.
+    jax.config.update("jax_enable_compilation_cache", False)
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(platformdirs, "user_cache_path", lambda *_, **__: folder)

@@ -124,26 +124,91 @@ def wait_for(process, condition):
     deadline = time.monotonic() + LIMIT
     while process.poll() is None and not condition():
         assert time.monotonic() < deadline, "it hangs"
-        time.sleep(0.0005)
+        time.sleep(0.005)
 
 
-def kill(process):
+def killed(process):
     """SIGKILL the process; whether it was alive."""
     process.kill()
     process.communicate(timeout=LIMIT)
     return process.returncode == -signal.SIGKILL
 
 
-def test_a_run_that_was_killed_three_times_is_as_one_that_never_was(runs, whole, tmp_path):
+def killed_between(runs, run, first, last):
+    """Killed at a random moment, when so many steps are saved."""
+    moments = random.Random(first)
+    steps = moments.randint(first, last)
+    process = runs.start(run)
+    wait_for(process, lambda: progress(run) >= steps)
+    time.sleep(moments.uniform(0.0, 0.2))
+    assert killed(process)
+
+
+def stopped_without_a_reader(runs, run):
+    """As `| tee log`, where a signal ends `tee` too."""
+    reader, writer = os.pipe()
+    process = subprocess.Popen(
+        runs.command(run), cwd=ROOT, env=runs.environment, stdout=writer, stderr=writer
+    )
+    os.close(writer)
+    os.read(reader, 1)
+    os.close(reader)
+    saved = progress(run)
+    wait_for(process, lambda: progress(run) > saved)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(LIMIT) == 130
+
+
+def killed_beside_a_second_process(runs, run):
+    """The second is refused, and writes nothing; the death of the first frees the folder."""
+    saved = progress(run)
+    first = runs.start(run)
+    wait_for(first, lambda: progress(run) > saved)
+    first.send_signal(signal.SIGSTOP)
+    try:
+        # Its other threads may still be on their way to a halt.
+        time.sleep(0.5)
+        before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+        second = runs.start(run)
+        _, errors = second.communicate(timeout=LIMIT)
+        assert errors == f"run_grid: --out: another process is at work in {run}\n"
+        assert second.returncode == 2
+        assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+    finally:
+        assert killed(first)
+
+
+def terminated_at(runs, run, steps):
+    process = runs.start(run)
+    wait_for(process, lambda: progress(run) >= steps)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=LIMIT)
+    assert errors == f"run_grid: stopped by SIGTERM; {CONTINUE}"
+    assert process.returncode == 143
+
+
+def finished_in_part(runs, run):
+    """A command for fewer cells shows its own, also where nothing can be printed."""
+    command = (*runs.command(run), "--n-demos", "1", "--seeds", "3")
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            command, cwd=ROOT, env=runs.environment, stdout=full, stderr=full, check=False
+        )
+    assert done.returncode == 0
+    rows = pl.read_parquet(run / "seeds.parquet").select("n_demos", "seed").rows()
+    assert rows == [(1, seed) for seed in range(3)]
+
+
+def test_a_run_that_all_of_this_befell_is_as_one_that_nothing_befell(runs, whole, tmp_path):
     run = tmp_path / "run"
-    moments = random.Random(0)
-    for number in range(3):
-        process = runs.start(run)
-        steps = moments.randint(1, 2 * STEPS * (number + 1) // 3 - 250)
-        wait_for(process, lambda steps=steps: progress(run) >= steps)
-        time.sleep(moments.uniform(0.0, 0.2))
-        assert kill(process)
-    runs.finish(run)
+    killed_between(runs, run, 1, 250)
+    stopped_without_a_reader(runs, run)
+    killed_beside_a_second_process(runs, run)
+    killed_between(runs, run, 1_000, 1_250)
+    terminated_at(runs, run, STEPS + 500)
+    finished_in_part(runs, run)
+    # The other cell has kept its checkpoint.
+    assert "hs-me-ddpg-n2-seeds-0-3 goes on from its checkpoint" in runs.finish(run)
     assert_same_run(run, whole)
 
 
@@ -184,7 +249,7 @@ def test_a_run_may_be_killed_in_any_phase(runs, whole, tmp_path, phase):
         process = runs.start(run, **fresh)
         wait_for(process, lambda began=began: written_since(began, run, pattern))
         time.sleep(moments.uniform(0.0, seconds))
-        kills += kill(process)
+        kills += killed(process)
         # It may have been too late.
         assert process.returncode in (0, -signal.SIGKILL)
         if (run / "summary.csv").exists():
@@ -204,58 +269,8 @@ def test_a_run_may_be_killed_among_its_experts(runs, tmp_path):
     for saved in (500, 2_000):
         process = runs.start(run, *without_demos)
         wait_for(process, lambda saved=saved: (run / f"checkpoints/experts/{saved}").exists())
-        assert kill(process)
+        assert killed(process)
     assert "experts goes on from its checkpoint" in runs.finish(run, *without_demos)
-    assert_same_run(run, whole)
-
-
-def test_a_signal_ends_a_run_with_its_code_and_a_line(runs, whole, tmp_path):
-    run = tmp_path / "run"
-    for number, steps in ((signal.SIGINT, 250), (signal.SIGTERM, STEPS + 250)):
-        process = runs.start(run)
-        wait_for(process, lambda steps=steps: progress(run) >= steps)
-        process.send_signal(number)
-        _, errors = process.communicate(timeout=LIMIT)
-        assert errors == f"run_grid: stopped by {number.name}; {CONTINUE}"
-        assert process.returncode == 128 + number
-    assert "goes on from its checkpoint" in runs.finish(run)
-    assert_same_run(run, whole)
-
-
-def test_a_cell_that_another_command_does_not_ask_for_keeps_its_checkpoint(runs, whole, tmp_path):
-    """The command for fewer cells is finished in between, and shows its own."""
-    run = tmp_path / "run"
-    process = runs.start(run)
-    wait_for(process, lambda: progress(run) >= STEPS + 500)
-    process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=LIMIT)
-    assert "[1/1]" not in runs.finish(run, "--n-demos", "1", "--seeds", "3")
-    assert pl.read_parquet(run / "seeds.parquet").select("n_demos", "seed").rows() == [
-        (1, seed) for seed in range(3)
-    ]
-    assert "hs-me-ddpg-n2-seeds-0-3 goes on from its checkpoint" in runs.finish(run)
-    assert_same_run(run, whole)
-
-
-def test_a_run_needs_no_reader(runs, whole, tmp_path):
-    """As `| tee log` where a signal ends `tee` too, and then `> /dev/full`."""
-    run = tmp_path / "run"
-    reader, writer = os.pipe()
-    process = subprocess.Popen(
-        runs.command(run), cwd=ROOT, env=runs.environment, stdout=writer, stderr=writer
-    )
-    os.close(writer)
-    os.read(reader, 1)
-    os.close(reader)
-    wait_for(process, lambda: progress(run) >= 500)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(LIMIT) == 130
-    assert 500 <= progress(run) < 2 * STEPS
-    with open("/dev/full", "w") as full:
-        process = subprocess.run(
-            runs.command(run), cwd=ROOT, env=runs.environment, stdout=full, stderr=full, check=False
-        )
-    assert process.returncode == 0
     assert_same_run(run, whole)
 
 
@@ -283,26 +298,6 @@ def test_a_signal_before_the_figures_is_obeyed(again, monkeypatch, capfd):
     monkeypatch.setattr(cells, "finished", signalled)
     assert again() == 130
     assert capfd.readouterr().err == f"run_grid: stopped by SIGINT; {CONTINUE}"
-
-
-def test_a_second_process_is_refused_and_a_crash_frees_the_folder(runs, whole, tmp_path):
-    run = tmp_path / "run"
-    first = runs.start(run)
-    wait_for(first, lambda: progress(run) >= 250)
-    first.send_signal(signal.SIGSTOP)
-    try:
-        # Its other threads may still be on their way to a halt.
-        time.sleep(0.5)
-        before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
-        second = runs.start(run)
-        _, errors = second.communicate(timeout=LIMIT)
-        assert errors == f"run_grid: --out: another process is at work in {run}\n"
-        assert second.returncode == 2
-        assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
-    finally:
-        assert kill(first)
-    runs.finish(run)
-    assert_same_run(run, whole)
 
 
 def can_mount():

@@ -102,6 +102,16 @@ def refused(main, tmp_path, capsys):
             "--env Walker2d-v5",
             "--env: unknown environment 'Walker2d-v5'; there are: MountainCarContinuous-v0",
         ),
+        ("--agent.tau 0", "--agent.tau: must be above 0 and at most 1, got 0.0"),
+        (
+            "--reward.learning-rate nan",
+            "--reward.learning-rate: must be at least 0 and finite, got nan",
+        ),
+        (
+            "--methods me-ddpg --reward.objective trajectory --schedule.replay-capacity 9",
+            "--methods me-ddpg: trajectories need a replay of 999 transitions: take a larger "
+            "schedule.replay_capacity",
+        ),
         ("--max-steps None", "--max-steps: give a number, or give --max-episodes"),
         ("--seed -1", "--seed: must be between 0 and 2^32 - 1, got -1"),
         (
@@ -302,14 +312,6 @@ def test_a_run_without_an_able_expert_leaves_everything_as_it_was(
     assert refused(*SMOKE, "--out", out) == "--experts: none"
 
 
-def test_a_mistake_ends_the_process_with_code_2_and_one_line(tmp_path):
-    done = run_command("--seeds", 0, "--out", tmp_path / "run")
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr == "run_grid: --seeds: must be at least 1, got 0\n"
-    assert not any(tmp_path.iterdir())
-
-
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory, compiled):
     """The folder and the output of a whole run."""
@@ -448,35 +450,36 @@ def test_fewer_cells_are_shown_without_training_and_all_again(smoke, main, monke
 
 
 def test_more_methods_numbers_and_seeds_train_what_is_missing(smoke, unoptimised, tmp_path):
-    """The numbers of a cell do not depend on the cells beside it."""
+    """The numbers of a cell depend neither on the cells beside it nor on the devices."""
     folder = shutil.copytree(smoke[0], tmp_path / "run")
     kept = snapshot(folder / "cells")
-    more = ("--methods", "ddpg", "me-ddpg", "--n-demos", 5, 9, "--seeds", 12)
+    more = ("--methods", "ddpg", "hs-ddpg", "--n-demos", 5, 9, "--seeds", 13)
     done = run_command(*SMOKE, *more, "--out", folder, **unoptimised)
     assert done.returncode == 0, done.stderr
     titles = [line for line in done.stdout.splitlines() if line.startswith("[") and "%" not in line]
     assert titles == [
-        "[1/3] ddpg, seeds 8 to 11",
-        "[2/3] me-ddpg-n5, seeds 8 to 11",
-        "[3/3] me-ddpg-n9, 12 seeds",
+        "[1/3] ddpg, seeds 8 to 12",
+        "[2/3] hs-ddpg-n5, seeds 8 to 12",
+        "[3/3] hs-ddpg-n9, 13 seeds",
     ]
     assert snapshot(folder / "cells").items() >= kept.items()
     table = pl.read_parquet(folder / "seeds.parquet")
     assert table.select("method", "n_demos", "seed").rows() == [
         (*cell, seed)
-        for cell in (("ddpg", 0), ("me-ddpg", 5), ("me-ddpg", 9))
-        for seed in range(12)
+        for cell in (("ddpg", 0), ("hs-ddpg", 5), ("hs-ddpg", 9))
+        for seed in range(13)
     ]
-    # Seeds 8 to 11 beside another number of demonstrations, and alone.
+    # All in one block on one device: seeds 0 to 7 of `smoke`, and 8 to 12 beside another cell.
     alone = tmp_path / "alone"
     pool = folder / "demonstrations" / "pool.npz"
     done = run_command(
-        *(*SMOKE, "--methods", "me-ddpg", "--n-demos", 5, "--seeds", 12),
-        *("--demos", pool, "--out", alone),
+        *(*SMOKE, "--methods", "hs-ddpg", "--n-demos", 5, "--seeds", 13),
+        *("--demos", pool, "--devices", 1, "--out", alone),
         **unoptimised,
     )
     assert done.returncode == 0, done.stderr
-    of_cell = (pl.col("method") == "me-ddpg") & (pl.col("n_demos") == 5)
+    assert "13 seeds per cell on 1 CPU device(s)" in done.stdout
+    of_cell = (pl.col("method") == "hs-ddpg") & (pl.col("n_demos") == 5)
     for name in TABLES:
         found = pl.read_parquet(folder / name).filter(of_cell)
         assert_frame_equal(found, pl.read_parquet(alone / name), rel_tol=1e-3, abs_tol=1e-3)
@@ -555,22 +558,6 @@ def test_a_run_cut_off_between_cells_resumes_to_the_same_tables(smoke, compiled,
     for name in TABLES:
         assert_frame_equal(pl.read_parquet(folder / name), pl.read_parquet(smoke[0] / name))
     assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
-
-
-@pytest.mark.skipif(start.cores() < 2, reason="there is one core")
-def test_seeds_do_not_depend_on_the_devices_that_share_them(tmp_path, unoptimised):
-    returns = []
-    for devices in (1, 2):
-        out = tmp_path / str(devices)
-        size = ("--seeds", 9, "--max-steps", 300, "--architecture.hidden", 8)
-        done = run_command(
-            "--methods", "ddpg", *size, "--devices", devices, "--out", out, **unoptimised
-        )
-        assert done.returncode == 0, done.stderr
-        assert f"9 seeds per cell on {devices} CPU device(s)" in done.stdout
-        returns.append(pl.read_parquet(out / "evaluations.parquet")["return_mean"].to_numpy())
-    assert returns[0].size == 9 * 3
-    np.testing.assert_allclose(*returns, rtol=1e-3, atol=1e-3)
 
 
 def test_methods_with_a_model_run_beside_the_others(unoptimised, demos, tmp_path):

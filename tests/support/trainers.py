@@ -5,6 +5,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from cmedirl_jax import training
 from cmedirl_jax.agents import hot_start
@@ -58,6 +59,11 @@ def start(method, settings=SMALL, key=0, **kwargs):
     state = init(jax.random.key(key), pool, 3)
 
     def advance(state, begin, end, max_episodes=None):
-        return run(state, pool, jnp.arange(begin, end), max_episodes)
+        """Step by step: each number of steps at once would be a program to compile."""
+        logs = []
+        for step in range(begin, end):
+            state, log = run(state, pool, np.arange(step, step + 1, dtype=np.int32), max_episodes)
+            logs.append(log)
+        return state, jax.tree.map(lambda *parts: np.concatenate(parts), *logs)
 
     return trainer, state, advance

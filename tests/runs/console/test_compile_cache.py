@@ -9,8 +9,13 @@ from cmedirl_jax.runs.console import compile_cache
 @pytest.fixture
 def configured():
     """JAX's configuration of its cache, as it was before the test."""
-    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    names = (
+        "jax_enable_compilation_cache",
+        "jax_compilation_cache_dir",
+        "jax_persistent_cache_min_compile_time_secs",
+    )
     before = {name: getattr(jax.config, name) for name in names}
+    jax.config.update("jax_enable_compilation_cache", True)
     compilation_cache.reset_cache()
     yield
     for name, value in before.items():
