@@ -12,6 +12,7 @@ from typing import Any
 
 import filelock
 
+from cmedirl_jax.io import atomic
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import cells, checkpoints, sealing
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
@@ -61,7 +62,7 @@ def check(folder: Path, config: dict[str, Any]) -> None:
 
 def _check_nothing_else_in(folder: Path) -> None:
     # A process that was killed before it had written its configuration may have been here.
-    own = {_LOCK, sealing.partial(folder / "config.json").name}
+    own = {_LOCK, atomic.partial(folder / "config.json").name}
     for path in sorted(folder.iterdir()):
         if path.name not in own:
             raise UserError(
@@ -138,8 +139,8 @@ def naming_the_option() -> Iterator[None]:
 
 def _remove_unfinished(folder: Path) -> None:
     """Remove what a process that was killed while writing left behind."""
-    _remove(sealing.partial(folder / name) for name in (*FILES, stored_demonstrations.FOLDER))
-    _remove((folder / cells.FOLDER).glob(sealing.partial(Path("*")).name))
+    _remove(atomic.partial(folder / name) for name in (*FILES, stored_demonstrations.FOLDER))
+    _remove((folder / cells.FOLDER).glob(atomic.partial(Path("*")).name))
 
 
 def _remove(paths: Iterable[Path]) -> None:
@@ -167,7 +168,7 @@ def note_cells_asked(folder: Path, config: dict[str, Any]) -> None:
 
 
 def _write(folder: Path, content: dict[str, Any]) -> None:
-    with sealing.replacing(folder / "config.json") as partial:
+    with atomic.replacing(folder / "config.json") as partial:
         partial.write_text(json.dumps(content, indent=2) + "\n")
 
 
