@@ -9,7 +9,7 @@ from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import atomic, checkpoint
 from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
-from tests.support import pools
+from tests.support import kills, pools
 
 
 @pytest.fixture
@@ -73,8 +73,7 @@ def test_checkpoints_are_flushed(tmp_path, events):
 @needs_proc
 def test_saved_trees_are_flushed(tmp_path, events):
     checkpoint.save(tmp_path / "tree", {"weights": np.zeros(3)})
-    flushed = {path for what, path in events if what == "flush"}
-    assert flushed >= {tmp_path, tmp_path / "tree", *(tmp_path / "tree").rglob("*")}
+    assert_safe(events, tmp_path / "tree", tmp_path / ".tree.partial" / "new")
 
 
 def contents(folder):
@@ -104,6 +103,17 @@ def test_replacing_leaves_things_as_they_were_after_an_error(tmp_path, before):
     with pytest.raises(RuntimeError):
         write_half()
     assert contents(tmp_path) == before
+
+
+def test_a_file_that_is_replaced_is_the_old_or_the_new_one_after_any_kill(tmp_path):
+    def write(folder, text):
+        with atomic.replacing(folder / "file") as partial:
+            partial.write_text(text)
+
+    def read(folder):
+        return (folder / "file").read_text()
+
+    kills.check_replaces(write, read, "old", "new", tmp_path)
 
 
 def test_file_systems_that_cannot_flush_folders_are_supported(tmp_path, monkeypatch):
