@@ -1,4 +1,4 @@
-"""Every file is written under another name and then moved into place, so none is ever half there."""
+"""Every file is written under another name and moved into place: none is ever half there."""
 
 import ast
 
