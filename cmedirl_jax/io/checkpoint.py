@@ -18,6 +18,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jax.experimental import multihost_utils
 from orbax.checkpoint import v1 as orbax
 
@@ -76,7 +77,7 @@ def _not_an_array(leaf: Any) -> str | None:
     """What a leaf is, if it is not an array that a checkpoint can hold."""
     kind = type(leaf).__name__
     arrays = (jax.Array, np.ndarray, np.generic)
-    if not isinstance(leaf, arrays) or isinstance(leaf, jax.core.Tracer):
+    if not isinstance(leaf, arrays) or isinstance(leaf, Tracer):
         return f"is of type {kind}"
     try:
         jax.typeof(leaf)
@@ -96,7 +97,7 @@ def _write(path: Path, tree: Any) -> None:
     if shutil.disk_usage(path.parent).free < needed:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
     with _os_errors(path):
-        orbax.save(new, tree)
+        orbax.save(str(new), tree)
     try:
         if first:
             _replace(new, path)
@@ -149,11 +150,11 @@ def load(path: str | Path, like: Any = None) -> Any:
         raise FileNotFoundError(f"{path}: no checkpoint there")
     with _os_errors(path):
         if like is None:
-            return orbax.load(path)
-        return _load(path, like)
+            return orbax.load(str(path))
+        return _load(str(path), like)
 
 
-def _load(path: Path, like: Any) -> Any:
+def _load(path: str, like: Any) -> Any:
     # Orbax does not complain if one tree has None where the other has an array.
     held = len(jax.tree.leaves(orbax.metadata(path).metadata))
     if held != len(jax.tree.leaves(like)):

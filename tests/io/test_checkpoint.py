@@ -1,4 +1,5 @@
 import gc
+from pathlib import Path
 from typing import NamedTuple
 
 import flax.struct
@@ -121,7 +122,7 @@ def test_a_traced_value_is_refused(tmp_path):
 @pytest.mark.parametrize("error", [OSError("no room"), RuntimeError("lost"), KeyboardInterrupt()])
 def test_a_save_that_fails_leaves_what_was_there(path, monkeypatch, error):
     def half(path, tree):
-        (path / "array").mkdir(parents=True)
+        Path(path, "array").mkdir(parents=True)
         raise error
 
     monkeypatch.setattr(checkpoint.orbax, "save", half)
@@ -134,13 +135,14 @@ def test_a_save_that_fails_leaves_what_was_there(path, monkeypatch, error):
 def test_a_save_killed_at_any_moment_leaves_the_old_or_the_new_checkpoint(tmp_path, monkeypatch):
     # A stand-in for orbax, whose changes on disk can be counted.
     def save(path, tree):
-        path.mkdir()
-        (path / "_CHECKPOINT_METADATA").write_text("finished")
-        (path / "deep").mkdir()
-        (path / "deep" / "value").write_text(str(tree["a"]))
+        Path(path, "deep").mkdir(parents=True)
+        Path(path, "_CHECKPOINT_METADATA").write_text("finished")
+        Path(path, "deep", "value").write_text(str(tree["a"]))
 
     monkeypatch.setattr(checkpoint.orbax, "save", save)
-    monkeypatch.setattr(checkpoint.orbax, "load", lambda path: (path / "deep/value").read_text())
+    monkeypatch.setattr(
+        checkpoint.orbax, "load", lambda path: Path(path, "deep", "value").read_text()
+    )
 
     def write(folder, value):
         checkpoint.save(folder / "state", {"a": np.int32(value)})
