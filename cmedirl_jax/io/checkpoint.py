@@ -107,12 +107,13 @@ def _write(path: Path, tree: Any) -> None:
 
 
 def _replace(new: Path, path: Path) -> None:
+    atomic.flush(new.parent)
+    atomic.flush_name(new.parent)
+    # No flush between the two moves: meanwhile nothing is at `path`.
     if path.exists():
-        # Flushed first, so that nothing is at `path` for no longer than two moves take.
-        atomic.flush(new)
-        atomic.flush_name(new.parent)
-        atomic.replace(path, new.with_name("old"))
-    atomic.replace(new, path)
+        os.replace(path, new.with_name("old"))
+    os.replace(new, path)
+    atomic.flush_name(path)
 
 
 def _tidy(path: Path) -> None:
