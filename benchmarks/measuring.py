@@ -15,6 +15,7 @@ from typing import Any
 
 from benchmarks.serving import Worker
 from benchmarks.workload import CAPACITY, Workload
+from cmedirl_jax.io import atomic
 from cmedirl_jax.runs.start import cores
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
@@ -159,7 +160,8 @@ def heading(program: str) -> dict[str, Any]:
 def write(result: dict[str, Any], path: Path) -> None:
     """Write a file of measurements; makes its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(result, indent=1) + "\n")
+    with atomic.replacing(path) as partial:
+        partial.write_text(json.dumps(result, indent=1) + "\n")
 
 
 def machine() -> dict[str, Any]:

@@ -25,6 +25,7 @@ from rich.table import Table
 from benchmarks import measuring
 from benchmarks.serving import Worker
 from benchmarks.workload import Workload
+from cmedirl_jax.io import atomic
 
 STEPS = 500
 """Environment steps per learner and round."""
@@ -109,6 +110,8 @@ def environment(name: str, requirements: Sequence[str], folder: Path) -> Path:
     wanted = "\n".join(requirements)
     if ready.exists() and ready.read_text() == wanted:
         return python
+    # First, because a process that is killed while it clears the folder may leave the file there.
+    ready.unlink(missing_ok=True)
     subprocess.run([sys.executable, "-m", "venv", "--clear", root], check=True)
     installed = subprocess.run(
         [python, "-m", "pip", "install", "--quiet", *requirements],
@@ -118,7 +121,8 @@ def environment(name: str, requirements: Sequence[str], folder: Path) -> Path:
     )
     if installed.returncode:
         raise RuntimeError(installed.stderr.strip()[-500:])
-    ready.write_text(wanted)
+    with atomic.replacing(ready) as partial:
+        partial.write_text(wanted)
     return python
 
 

@@ -9,6 +9,9 @@ import numpy as np
 matplotlib.use("agg")
 from matplotlib import pyplot as plt
 from matplotlib import ticker
+from matplotlib.figure import Figure
+
+from cmedirl_jax.io import atomic
 
 
 def growth(records: list[dict[str, Any]], path: Path) -> None:
@@ -45,8 +48,7 @@ def growth(records: list[dict[str, Any]], path: Path) -> None:
     axes[0].set_ylabel("seconds for 12,000 steps")
     axes[0].yaxis.set_major_formatter(ticker.StrMethodFormatter("{x:,g}"))
     figure.suptitle("DDPG on one core; 100 seeds, (64, 64), batch 32 where not said otherwise")
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    _save(figure, path)
 
 
 def _standard(record: dict[str, Any]) -> bool:
@@ -66,5 +68,10 @@ def soak(samples: list[dict[str, Any]], path: Path) -> None:
     for axis, (label, values) in zip(axes, panels.items(), strict=True):
         axis.plot(minutes, values)
         axis.set(xlabel="minutes", ylabel=label, ylim=(0, None))
-    figure.savefig(path, dpi=150)
+    _save(figure, path)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    with atomic.replacing(path) as partial:
+        figure.savefig(partial, format=path.suffix[1:], dpi=150)
     plt.close(figure)

@@ -21,11 +21,12 @@ from rich.console import Console
 from rich.table import Table
 
 from cmedirl_jax import envs
+from cmedirl_jax.io import atomic
 from cmedirl_jax.runs import statistics
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.statistics import SeedStatistics
 from cmedirl_jax.runs.storage import folder as run_folder
-from cmedirl_jax.runs.storage import sealing, tables
+from cmedirl_jax.runs.storage import tables
 
 MEASURES: dict[str, Callable[[SeedStatistics, int], np.ndarray]] = {
     "convergence_env_step": lambda seeds, most: np.minimum(seeds.convergence_env_step, most),
@@ -64,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"compare: {error}", file=sys.stderr)
         return 2
     if options.out is not None:
-        with sealing.replacing(options.out) as partial:
+        with atomic.replacing(options.out) as partial:
             table.write_csv(partial)
     Console(width=None if sys.stdout.isatty() else 120).print(shown(table, options.against))
     return 0

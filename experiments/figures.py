@@ -14,6 +14,7 @@ import polars as pl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cmedirl_jax.io import atomic
 from cmedirl_jax.runs import statistics
 from cmedirl_jax.training.methods import METHODS
 
@@ -49,8 +50,8 @@ def draw(
             path = folder / f"{name}.{suffix}"
             # No date and no random ids: drawing the same tables again gives the same file.
             metadata = {"Date": None} if suffix == "svg" else {"Software": None}
-            with plt.rc_context({"svg.hashsalt": name}):
-                figure.savefig(path, dpi=150, metadata=metadata)
+            with plt.rc_context({"svg.hashsalt": name}), atomic.replacing(path) as partial:
+                figure.savefig(partial, format=suffix, dpi=150, metadata=metadata)
             paths.append(path)
         plt.close(figure)
     return paths

@@ -22,6 +22,7 @@ from rich.table import Table
 
 from cmedirl_jax import envs, ranges
 from cmedirl_jax.envs import Env
+from cmedirl_jax.io import atomic
 from cmedirl_jax.ranges import AtLeastTwo, BelowOne, Size
 from cmedirl_jax.runs.console import compile_cache
 from cmedirl_jax.tabular import discretise, interpolation
@@ -70,7 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console.print(shown)
     if options.out is not None:
         options.out.parent.mkdir(parents=True, exist_ok=True)
-        table.write_csv(options.out)
+        with atomic.replacing(options.out) as partial:
+            table.write_csv(partial)
         console.print(f"Table: {options.out}", highlight=False, soft_wrap=True)
     return 0
 

@@ -28,20 +28,15 @@ def save(path: str | Path, demonstrations: Demonstrations) -> None:
     validate(demonstrations)
     path = Path(path)
     header = {"format": FORMAT, "version": FORMAT_VERSION, "metadata": demonstrations.metadata}
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with partial.open("wb") as file:
-            np.savez_compressed(
-                file,
-                allow_pickle=False,
-                header=np.array(json.dumps(header, sort_keys=True)),
-                truncated=np.asarray(demonstrations.truncated),
-                episode=np.asarray(demonstrations.episode),
-                **{name: np.asarray(x) for name, x in demonstrations.transition._asdict().items()},
-            )
-        atomic.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with atomic.replacing(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(
+            file,
+            allow_pickle=False,
+            header=np.array(json.dumps(header, sort_keys=True)),
+            truncated=np.asarray(demonstrations.truncated),
+            episode=np.asarray(demonstrations.episode),
+            **{name: np.asarray(x) for name, x in demonstrations.transition._asdict().items()},
+        )
 
 
 def load(path: str | Path, spec: EnvSpec | None = None) -> Demonstrations:

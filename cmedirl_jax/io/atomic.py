@@ -1,18 +1,36 @@
 """Files and folders that appear on disk whole: a power cut leaves all of one, or nothing."""
 
+import contextlib
 import errno
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 
-def replace(partial: Path, path: Path) -> None:
-    """Flush the file or folder `partial` to the disk, and move it to `path`.
+def partial(path: Path) -> Path:
+    """Where a file or a folder lies until it is whole."""
+    return path.with_name(f".{path.name}.partial")
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a path to write to, which then replaces `path` in one move; an error leaves nothing."""
+    written = partial(path)
+    try:
+        yield written
+        replace(written, path)
+    finally:
+        written.unlink(missing_ok=True)
+
+
+def replace(written: Path, path: Path) -> None:
+    """Flush the file or folder `written` to the disk, and move it to `path`.
 
     Raises:
         OSError: if it cannot be flushed or moved.
     """
-    flush(partial)
-    os.replace(partial, path)
+    flush(written)
+    os.replace(written, path)
     flush_name(path)
 
 

@@ -274,6 +274,19 @@ def test_a_peers_environment_is_made_once_and_again_for_other_requirements(tmp_p
     assert len(commands) == 4
 
 
+def test_an_environment_that_was_half_cleared_is_made_again(tmp_path, monkeypatch):
+    (tmp_path / "peer").mkdir()
+    (tmp_path / "peer" / "requirements.txt").write_text("this")
+
+    def stop(command, **_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(peers.subprocess, "run", stop)
+    for requirements in (("other",), ("this",)):
+        with pytest.raises(KeyboardInterrupt):
+            peers.environment("peer", requirements, tmp_path)
+
+
 def test_an_installation_that_fails_is_not_taken_for_done(tmp_path, monkeypatch):
     def run(command, **_):
         if "venv" in command:

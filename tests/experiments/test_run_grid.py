@@ -288,7 +288,7 @@ def test_another_configuration_in_the_same_folder_is_refused(refused, option, be
     arguments = (*SMOKE, "--out", "run")
     config = run_grid.parse(arguments)
     with run_folder.opened(config.folder, validation.describe(config)):
-        pass
+        (config.folder / "demonstrations").mkdir()
     line = refused(*arguments, option, now)
     assert line.startswith(f"--out: run holds a run with {option} {before}, not {now};")
 

@@ -9,7 +9,7 @@ from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import atomic, checkpoint
 from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
-from tests.support import pools
+from tests.support import kills, pools
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_a_file_and_a_folder_are_flushed_before_they_take_their_names(tmp_path, 
 @needs_proc
 def test_demonstrations_are_flushed(tmp_path, events):
     demonstrations.save(tmp_path / "pool.npz", pools.scripted(2))
-    assert_safe(events, tmp_path / "pool.npz", tmp_path / "pool.npz.partial")
+    assert_safe(events, tmp_path / "pool.npz", tmp_path / ".pool.npz.partial")
 
 
 @needs_proc
@@ -73,8 +73,47 @@ def test_checkpoints_are_flushed(tmp_path, events):
 @needs_proc
 def test_saved_trees_are_flushed(tmp_path, events):
     checkpoint.save(tmp_path / "tree", {"weights": np.zeros(3)})
-    flushed = {path for what, path in events if what == "flush"}
-    assert flushed >= {tmp_path, tmp_path / "tree", *(tmp_path / "tree").rglob("*")}
+    assert_safe(events, tmp_path / "tree", tmp_path / ".tree.partial" / "new")
+
+
+def contents(folder):
+    """Every file in `folder`, with its bytes."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_replacing_moves_the_whole_file_into_place(tmp_path):
+    path = tmp_path / "table"
+    path.write_text("old")
+    with atomic.replacing(path) as partial:
+        partial.write_text("new")
+        assert path.read_text() == "old"
+    assert contents(tmp_path) == {"table": b"new"}
+
+
+@pytest.mark.parametrize("before", [{}, {"table": b"old"}])
+def test_replacing_leaves_things_as_they_were_after_an_error(tmp_path, before):
+    for name, content in before.items():
+        (tmp_path / name).write_bytes(content)
+
+    def write_half():
+        with atomic.replacing(tmp_path / "table") as partial:
+            partial.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        write_half()
+    assert contents(tmp_path) == before
+
+
+def test_a_file_that_is_replaced_is_the_old_or_the_new_one_after_any_kill(tmp_path):
+    def write(folder, text):
+        with atomic.replacing(folder / "file") as partial:
+            partial.write_text(text)
+
+    def read(folder):
+        return (folder / "file").read_text()
+
+    kills.check_replaces(write, read, "old", "new", tmp_path)
 
 
 def test_file_systems_that_cannot_flush_folders_are_supported(tmp_path, monkeypatch):

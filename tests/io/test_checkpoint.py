@@ -1,4 +1,5 @@
 import gc
+from pathlib import Path
 from typing import NamedTuple
 
 import flax.struct
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from cmedirl_jax.io import checkpoint
+from tests.support import kills
 
 # Orbax warns on every load without shardings, which is how `load` without `like` reads.
 pytestmark = pytest.mark.filterwarnings("ignore:Sharding info not provided:UserWarning")
@@ -81,6 +83,92 @@ def test_saving_replaces_what_is_there(tmp_path):
     checkpoint.save(tmp_path / "state", make_state(8))
     assert_equal(checkpoint.load(tmp_path / "state", make_state(8)), make_state(8))
     assert [entry.name for entry in tmp_path.iterdir()] == ["state"]
+
+
+def test_a_numpy_scalar_is_saved_as_an_array(tmp_path):
+    tree = {"float": np.float32(1.5), "flag": np.bool_(True)}
+    checkpoint.save(tmp_path / "state", tree)
+    assert_equal(checkpoint.load(tmp_path / "state", tree), jax.tree.map(np.asarray, tree))
+
+
+@pytest.mark.parametrize(
+    ("tree", "message"),
+    [
+        ({"a": [1.5]}, r"tree\['a'\]\[0\]: is of type float; expected an array"),
+        (3, "tree: is of type int; expected an array"),
+        ({"a": "text"}, "is of type str;"),
+        ({"a": jax.ShapeDtypeStruct((2,), float)}, "is of type ShapeDtypeStruct;"),
+        ({"a": np.array([None])}, r"tree\['a'\]: is of type ndarray and dtype object;"),
+        ({"a": np.array(["text"])}, "is of type ndarray and dtype <U4;"),
+        ({"a": np.ma.masked_array([1.0], [True])}, "is of type MaskedArray and dtype float64;"),
+        ({"a": np.zeros((0, 3))}, r"tree\['a'\]: has shape \(0, 3\);"),
+        ({"a": jnp.zeros(0)}, r"tree\['a'\]: has shape \(0,\);"),
+        ({}, "tree: has no leaves; expected one array or more"),
+        (None, "tree: has no leaves;"),
+    ],
+)
+def test_what_cannot_be_saved_is_refused_and_leaves_what_was_there(path, tree, message):
+    with pytest.raises(ValueError, match=message):
+        checkpoint.save(path, tree)
+    assert_equal(checkpoint.load(path, STATE), STATE)
+    assert [entry.name for entry in path.parent.iterdir()] == ["state"]
+
+
+def test_a_traced_value_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="Tracer"):
+        jax.eval_shape(lambda x: checkpoint.save(tmp_path / "state", x), 1.0)
+
+
+@pytest.mark.parametrize("error", [OSError("no room"), RuntimeError("lost"), KeyboardInterrupt()])
+def test_a_save_that_fails_leaves_what_was_there(path, monkeypatch, error):
+    def half(path, tree):
+        Path(path, "array").mkdir(parents=True)
+        raise error
+
+    monkeypatch.setattr(checkpoint.orbax, "save", half)
+    with pytest.raises(type(error)):
+        checkpoint.save(path, make_state(8))
+    assert_equal(checkpoint.load(path, STATE), STATE)
+    assert [entry.name for entry in path.parent.iterdir()] == ["state"]
+
+
+def test_a_save_killed_at_any_moment_leaves_the_old_or_the_new_checkpoint(tmp_path, monkeypatch):
+    # A stand-in for orbax, whose changes on disk can be counted.
+    def save(path, tree):
+        Path(path, "deep").mkdir(parents=True)
+        Path(path, "_CHECKPOINT_METADATA").write_text("finished")
+        Path(path, "deep", "value").write_text(str(tree["a"]))
+
+    monkeypatch.setattr(checkpoint.orbax, "save", save)
+    monkeypatch.setattr(
+        checkpoint.orbax, "load", lambda path: Path(path, "deep", "value").read_text()
+    )
+
+    def write(folder, value):
+        checkpoint.save(folder / "state", {"a": np.int32(value)})
+
+    kills.check_replaces(
+        write, lambda folder: checkpoint.load(folder / "state"), "1", "2", tmp_path
+    )
+
+
+def test_between_the_moves_of_a_save_the_old_checkpoint_is_loaded(tmp_path):
+    checkpoint.save(tmp_path / "state", STATE)
+    (tmp_path / ".state.partial").mkdir()
+    (tmp_path / "state").rename(tmp_path / ".state.partial" / "old")
+    assert_equal(checkpoint.load(tmp_path / "state", STATE), STATE)
+    with pytest.raises(ValueError, match="no leaves"):
+        checkpoint.save(tmp_path / "state", {})
+    assert_equal(checkpoint.load(tmp_path / "state", STATE), STATE)
+
+
+def test_a_link_to_a_checkpoint_stays_one(tmp_path):
+    checkpoint.save(tmp_path / "state", STATE)
+    (tmp_path / "link").symlink_to("state")
+    checkpoint.save(tmp_path / "link", make_state(8))
+    assert (tmp_path / "link").is_symlink()
+    for name in ("link", "state"):
+        assert_equal(checkpoint.load(tmp_path / name, make_state(8)), make_state(8))
 
 
 @pytest.mark.parametrize("like", [None, STATE])

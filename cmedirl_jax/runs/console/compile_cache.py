@@ -2,7 +2,12 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+import importlib
+import os
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import jax
 import platformdirs
@@ -13,6 +18,8 @@ _DURATIONS = (
     "/jax/core/compile/backend_compile_duration",
 )
 _HIT, _MISS = "/jax/compilation_cache/cache_hits", "/jax/compilation_cache/cache_misses"
+_CHECKED = ".cmedirl_jax-checked"
+"""A file in the cache's folder: entries that are older than it were found whole."""
 
 
 @dataclasses.dataclass
@@ -54,9 +61,55 @@ def counted() -> Iterator[Cost]:
 
 
 def use_cache() -> None:
-    """Keep compiled programs in the user's cache folder, unless JAX was told where to keep them."""
-    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
-        folder = platformdirs.user_cache_path("cmedirl_jax", appauthor=False) / "compiled"
-        jax.config.update("jax_compilation_cache_dir", str(folder))
+    """Keep compiled programs in the user's cache folder, unless JAX was told where to keep them.
+
+    JAX writes entries in place. One that a kill or a full disk cut short is removed here: JAX would
+    warn of it, and compile its program again, at every start.
+    """
+    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if folder is None:
+        folder = str(platformdirs.user_cache_path("cmedirl_jax", appauthor=False) / "compiled")
+        jax.config.update("jax_compilation_cache_dir", folder)
     # Small programs too: there are many, and each would be compiled at every start.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    # JAX itself complains of a folder that it cannot use; without a name there is no cache.
+    if folder and Path(folder).is_dir():
+        with contextlib.suppress(OSError):
+            _remove_cut_short(Path(folder))
+
+
+def _remove_cut_short(folder: Path) -> None:
+    """Remove entries that are not whole, of those written since the last check."""
+    checked = folder / _CHECKED
+    before = checked.stat().st_mtime_ns if checked.exists() else 0
+    # The time before the check, by the clock of the folder's file system.
+    with tempfile.TemporaryFile(dir=folder) as file:
+        now = os.fstat(file.fileno()).st_mtime_ns
+    decompressors = _decompressors()
+    for entry in folder.glob("*-cache"):
+        # Another process may remove it first, or it is another user's.
+        with contextlib.suppress(OSError):
+            if entry.stat().st_mtime_ns >= before and not _whole(entry.read_bytes(), decompressors):
+                entry.unlink()
+    checked.touch()
+    os.utime(checked, ns=(now, now))
+
+
+def _decompressors() -> dict[bytes, Callable[[bytes], bytes]]:
+    """What decompresses entries, by their first byte: zlib, and zstd where JAX finds it."""
+    found: dict[bytes, Callable[[bytes], bytes]] = {zlib.compress(b"")[:1]: zlib.decompress}
+    for module in ("zstandard", "compression.zstd"):
+        with contextlib.suppress(ImportError):
+            found[b"\x28"] = importlib.import_module(module).decompress
+    return found
+
+
+def _whole(entry: bytes, decompressors: dict[bytes, Callable[[bytes], bytes]]) -> bool:
+    """Whether an entry can be decompressed; one of an unknown compressor counts as whole."""
+    if not entry:
+        return False
+    try:
+        decompressors.get(entry[:1], bytes)(entry)
+    except Exception:
+        return False
+    return True

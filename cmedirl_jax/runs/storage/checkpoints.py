@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from cmedirl_jax.io import checkpoint
+from cmedirl_jax.io import atomic, checkpoint
 from cmedirl_jax.runs.cluster.base import ALONE, Cluster
 from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.errors import UserError
@@ -178,7 +178,7 @@ class Checkpointer:
 
     def _write(self, snapshot: Snapshot) -> None:
         # A process that was killed may have left a checkpoint of another step unfinished.
-        for unfinished in self.folder.glob(sealing.partial(self.folder / "*").name):
+        for unfinished in self.folder.glob(atomic.partial(self.folder / "*").name):
             shutil.rmtree(unfinished, ignore_errors=True)
         content = {"step": snapshot.step, "identity": self.identity}
         with sealing.sealed(self.folder / str(snapshot.step), content) as unfinished:

@@ -12,6 +12,7 @@ from typing import Any
 
 import filelock
 
+from cmedirl_jax.io import atomic
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import cells, checkpoints, sealing
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
@@ -61,7 +62,7 @@ def check(folder: Path, config: dict[str, Any]) -> None:
 
 def _check_nothing_else_in(folder: Path) -> None:
     # A process that was killed before it had written its configuration may have been here.
-    own = {_LOCK, sealing.partial(folder / "config.json").name}
+    own = {_LOCK, atomic.partial(folder / "config.json").name}
     for path in sorted(folder.iterdir()):
         if path.name not in own:
             raise UserError(
@@ -74,8 +75,9 @@ def _check_nothing_else_in(folder: Path) -> None:
 def opened(folder: Path, config: dict[str, Any]) -> Iterator[list[cells.SavedCell]]:
     """Hold the run's folder against other processes; gives its finished cells.
 
-    The folder and its config.json are made where they are missing. A `UserError` before the first
-    cell is finished leaves the folder as it was.
+    The folder and its config.json are made where they are missing. A run that has saved nothing of
+    its training has not begun: its config.json is replaced. A `UserError` before the first cell is
+    finished leaves nothing new in the folder.
 
     Raises:
         UserError: as `check`, if another process holds the folder, or a cell is damaged.
@@ -94,7 +96,8 @@ def opened(folder: Path, config: dict[str, Any]) -> Iterator[list[cells.SavedCel
             with naming_the_option():
                 finished = cells.finished(folder)
             _remove_unfinished(folder)
-            if not (folder / "config.json").exists():
+            if not ((folder / "config.json").exists() and _begun(folder)):
+                _remove([folder / stored_demonstrations.FOLDER])
                 _write(folder, {"schema": sealing.SCHEMA, "config": config, "versions": versions()})
             yield finished
         except UserError:
@@ -138,8 +141,9 @@ def naming_the_option() -> Iterator[None]:
 
 def _remove_unfinished(folder: Path) -> None:
     """Remove what a process that was killed while writing left behind."""
-    _remove(sealing.partial(folder / name) for name in (*FILES, stored_demonstrations.FOLDER))
-    _remove((folder / cells.FOLDER).glob(sealing.partial(Path("*")).name))
+    _remove(atomic.partial(folder / name) for name in (*FILES, stored_demonstrations.FOLDER))
+    for name in (cells.FOLDER, "figures"):
+        _remove((folder / name).glob(atomic.partial(Path("*")).name))
 
 
 def _remove(paths: Iterable[Path]) -> None:
@@ -162,12 +166,23 @@ def note_cells_asked(folder: Path, config: dict[str, Any]) -> None:
     """Write to config.json which cells `config` asks for: those that the run's tables show."""
     written = read(folder)
     now = written["config"] | {name: config[name] for name in CELLS_ASKED}
-    if now != written["config"]:
-        _write(folder, written | {"config": now})
+    _write(folder, written | {"config": now})
+
+
+def _begun(folder: Path) -> bool:
+    """Whether something is saved that was trained by config.json; a copy of --demos was not."""
+    copied = read(folder)["config"].get("demos") is not None
+    return (
+        cells.any_begun(folder)
+        or any(folder.glob(f"{checkpoints.FOLDER}/*/*/{sealing.SEAL}"))
+        or ((folder / stored_demonstrations.FOLDER).exists() and not copied)
+    )
 
 
 def _write(folder: Path, content: dict[str, Any]) -> None:
-    with sealing.replacing(folder / "config.json") as partial:
+    if (folder / "config.json").exists() and read(folder) == content:
+        return
+    with atomic.replacing(folder / "config.json") as partial:
         partial.write_text(json.dumps(content, indent=2) + "\n")
 
 
@@ -217,6 +232,8 @@ def identity(config: dict[str, Any]) -> dict[str, Any]:
 def _compare(folder: Path, config: dict[str, Any]) -> None:
     with naming_the_option():
         before, now = _flat(read(folder)["config"]), _flat(config)
+    if not _begun(folder):
+        return
     for name in sorted(before.keys() | now.keys()):
         if name not in _NOT_COMPARED and before.get(name) != now.get(name):
             raise UserError(

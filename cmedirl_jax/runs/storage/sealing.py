@@ -41,7 +41,7 @@ def sealed(path: Path, content: dict[str, Any]) -> Iterator[Path]:
     Raises:
         OSError: if it cannot be written, or the name is not free.
     """
-    unfinished = partial(path)
+    unfinished = atomic.partial(path)
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
     try:
@@ -105,19 +105,3 @@ def _digests(folder: Path) -> dict[str, str]:
 
 def _digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
-
-
-def partial(path: Path) -> Path:
-    """Where a file or a folder lies until it is whole."""
-    return path.with_name(f".{path.name}.partial")
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Give a path to write to, which then replaces `path` in one move; an error leaves nothing."""
-    written = partial(path)
-    try:
-        yield written
-        atomic.replace(written, path)
-    finally:
-        written.unlink(missing_ok=True)

@@ -9,10 +9,11 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
+from cmedirl_jax.io import atomic
 from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.gymnasium_replay import Replay
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.storage import cells, sealing
+from cmedirl_jax.runs.storage import cells
 from cmedirl_jax.runs.storage.cells import TABLES, CellKey, SavedCell
 
 FILES = tuple(f"{name}.parquet" for name in TABLES)
@@ -164,6 +165,6 @@ def write_if_other(path: Path, content: bytes) -> bool:
     """Write a file, unless it has this content; returns whether it was written."""
     if path.is_file() and path.read_bytes() == content:
         return False
-    with sealing.replacing(path) as partial:
+    with atomic.replacing(path) as partial:
         partial.write_bytes(content)
     return True

@@ -1,3 +1,8 @@
+import contextlib
+import os
+import sys
+import types
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -60,3 +65,47 @@ def test_a_cache_that_jax_was_given_is_kept(configured, tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     compile_cache.use_cache()
     assert jax.config.jax_compilation_cache_dir == str(tmp_path)
+
+
+@pytest.mark.parametrize("left", [0, 1, 40, -1])
+def test_a_program_that_was_cut_short_on_disk_is_compiled_once_more(configured, tmp_path, left):
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    compile_cache.use_cache()
+    compile_something()
+    (entry,) = tmp_path.glob("*-cache")
+    entry.write_bytes(entry.read_bytes()[:left])
+    # Without a warning, which would be an error here; and the next start finds it.
+    for counts in ((0, 1), (1, 0)):
+        compile_cache.use_cache()
+        with compile_cache.counted() as cost:
+            compile_something()
+        assert (cost.hits, cost.misses) == counts
+
+
+def test_entries_are_checked_once_and_those_of_other_programs_stay(
+    configured, tmp_path, monkeypatch
+):
+    def refuse(entry):
+        raise ValueError(entry)
+
+    monkeypatch.setitem(sys.modules, "zstandard", types.SimpleNamespace(decompress=refuse))
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    short = {"zlib-cache": b"\x78\x9cshort", "zstd-cache": b"\x28\xb5\x2f\xfdshort"}
+    others = {"other-cache": b"another compressor's", "notes": b""}
+    for name, content in (short | others).items():
+        (tmp_path / name).write_bytes(content)
+    compile_cache.use_cache()
+    assert {path.name for path in tmp_path.iterdir()} == {*others, ".cmedirl_jax-checked"}
+    # An old entry is not read again.
+    (tmp_path / "zlib-cache").write_bytes(short["zlib-cache"])
+    os.utime(tmp_path / "zlib-cache", (1.0, 1.0))
+    compile_cache.use_cache()
+    assert (tmp_path / "zlib-cache").exists()
+
+
+@pytest.mark.parametrize("folder", ["", "gs://bucket/cache"])
+def test_a_cache_that_is_no_folder_here_is_left_to_jax(configured, tmp_path, folder):
+    jax.config.update("jax_compilation_cache_dir", folder)
+    with contextlib.chdir(tmp_path):
+        compile_cache.use_cache()
+    assert not any(tmp_path.iterdir())

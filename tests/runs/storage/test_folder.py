@@ -17,7 +17,7 @@ from cmedirl_jax.runs.storage.cells import CellKey
 from cmedirl_jax.training.settings import Settings
 from experiments.presets import PRESETS
 from tests.support import cells as cells_of
-from tests.support import damages
+from tests.support import damages, kills
 
 
 @pytest.fixture
@@ -38,6 +38,24 @@ def opened(config):
     """Enter the run's folder and leave it; returns the folder."""
     with opening(config):
         return config.folder
+
+
+def begun(config, saved="checkpoint"):
+    """A run's folder in which training has saved something; returns the folder."""
+    folder = opened(config)
+    if saved == "cell":
+        cells_of.save(folder, CellKey(0, "none", "ddpg", 0, 0, 2))
+    elif saved == "checkpoint":
+        write(folder, ("checkpoints/experts/250/seal.json",))
+    else:
+        write(folder, ("demonstrations/pool.npz",))
+    return folder
+
+
+def write(folder, names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(name)
 
 
 def test_configuration_is_strict_json_with_versions(tmp_path):
@@ -77,7 +95,7 @@ def test_the_same_configuration_enters_again_and_changes_nothing(preset, tmp_pat
     ],
 )
 def test_another_configuration_is_refused_naming_the_option_and_both_values(config, change, named):
-    folder = opened(config)
+    folder = begun(config)
     before = contents(folder)
     with pytest.raises(UserError) as error:
         opened(dataclasses.replace(config, **change))
@@ -87,8 +105,46 @@ def test_another_configuration_is_refused_naming_the_option_and_both_values(conf
     assert contents(folder) == before
 
 
-def test_methods_numbers_and_seeds_may_differ_and_are_noted_once_the_tables_show_them(config):
+@pytest.mark.parametrize("saved", ["cell", "checkpoint", "demonstrations"])
+def test_what_training_has_saved_keeps_its_configuration(config, saved):
+    folder = begun(config, saved)
+    before = contents(folder)
+    with pytest.raises(UserError, match="holds a run with --seed 0, not 3"):
+        opened(dataclasses.replace(config, seed=3))
+    assert contents(folder) == before
+
+
+def test_a_start_that_crashed_refuses_no_other_options(config):
+    copied = dataclasses.replace(config, demos=Path(__file__), seed=1)
+    folder = opened(copied)
+    write(folder, ("demonstrations/pool.npz", "checkpoints/ddpg-seeds-0-9/.250.partial/state"))
+    opened(config)
+    assert run_folder.read(folder)["config"] == validation.describe(config)
+    # The copy of other --demos is gone: the experts' demonstrations are missing, and made.
+    assert not (folder / "demonstrations").exists()
+
+
+def test_a_crashed_start_leaves_no_versions_to_later_ones(config, monkeypatch):
+    monkeypatch.setattr(run_folder, "versions", lambda: {"jax": "0.1"})
     folder = opened(config)
+    monkeypatch.undo()
+    opened(config)
+    assert run_folder.other_versions(folder) == {}
+
+
+def test_a_start_killed_at_any_moment_hinders_no_other(tmp_path):
+    def start(folder, seed):
+        with run_folder.opened(folder / "run", {"seed": seed, "demos": "pool.npz"}):
+            write(folder / "run", ("demonstrations/pool.npz",))
+
+    def seed(folder):
+        return run_folder.read(folder / "run")["config"]["seed"]
+
+    kills.check_replaces(start, seed, 1, 2, tmp_path)
+
+
+def test_methods_numbers_and_seeds_may_differ_and_are_noted_once_the_tables_show_them(config):
+    folder = begun(config)
     before = contents(folder)
     more = dataclasses.replace(config, methods=("ddpg", "bc"), n_demos=(1, 10), seeds=3)
     opened(more)
@@ -179,15 +235,9 @@ def test_a_folder_whose_run_was_killed_at_once_is_taken(config):
 
 UNFINISHED = (
     *(".seeds.parquet.partial", ".demonstrations.partial/pool.npz.partial"),
-    "cells/.ddpg-seeds-0-99.partial/policies/file",
+    *("cells/.ddpg-seeds-0-99.partial/policies/file", "figures/.figure3.png.partial"),
 )
 SOMEBODYS = (".notes.partial", "downloads/film.partial", "cells/mine", "notes.txt")
-
-
-def write(folder, names):
-    for name in names:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(name)
 
 
 def test_what_a_killed_run_left_is_removed_and_nothing_else(config):

@@ -25,31 +25,6 @@ def seal(path, **content):
     return path
 
 
-def test_replacing_moves_the_whole_file_into_place(tmp_path):
-    path = tmp_path / "table"
-    path.write_text("old")
-    with sealing.replacing(path) as partial:
-        partial.write_text("new")
-        assert path.read_text() == "old"
-    assert contents(tmp_path) == {path: b"new"}
-
-
-@pytest.mark.parametrize("before", [{}, {"table": b"old"}])
-def test_replacing_leaves_things_as_they_were_after_an_error(tmp_path, before):
-    before = {tmp_path / name: content for name, content in before.items()}
-    for path, content in before.items():
-        path.write_bytes(content)
-
-    def write_half():
-        with sealing.replacing(tmp_path / "table") as partial:
-            partial.write_text("half")
-            raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        write_half()
-    assert contents(tmp_path) == before
-
-
 def test_a_sealed_folder_appears_in_one_move_and_says_what_it_holds(tmp_path):
     path = tmp_path / "new" / "cell"
     with sealing.sealed(path, {"step": 3}) as unfinished:
