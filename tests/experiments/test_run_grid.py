@@ -453,33 +453,33 @@ def test_more_methods_numbers_and_seeds_train_what_is_missing(smoke, unoptimised
     """The numbers of a cell depend neither on the cells beside it nor on the devices."""
     folder = shutil.copytree(smoke[0], tmp_path / "run")
     kept = snapshot(folder / "cells")
-    more = ("--methods", "ddpg", "hs-ddpg", "--n-demos", 5, 9, "--seeds", 13)
+    more = ("--methods", "ddpg", "me-ddpg", "--n-demos", 5, 9, "--seeds", 13)
     done = run_command(*SMOKE, *more, "--out", folder, **unoptimised)
     assert done.returncode == 0, done.stderr
     titles = [line for line in done.stdout.splitlines() if line.startswith("[") and "%" not in line]
     assert titles == [
         "[1/3] ddpg, seeds 8 to 12",
-        "[2/3] hs-ddpg-n5, seeds 8 to 12",
-        "[3/3] hs-ddpg-n9, 13 seeds",
+        "[2/3] me-ddpg-n5, seeds 8 to 12",
+        "[3/3] me-ddpg-n9, 13 seeds",
     ]
     assert snapshot(folder / "cells").items() >= kept.items()
     table = pl.read_parquet(folder / "seeds.parquet")
     assert table.select("method", "n_demos", "seed").rows() == [
         (*cell, seed)
-        for cell in (("ddpg", 0), ("hs-ddpg", 5), ("hs-ddpg", 9))
+        for cell in (("ddpg", 0), ("me-ddpg", 5), ("me-ddpg", 9))
         for seed in range(13)
     ]
     # All in one block on one device: seeds 0 to 7 of `smoke`, and 8 to 12 beside another cell.
     alone = tmp_path / "alone"
     pool = folder / "demonstrations" / "pool.npz"
     done = run_command(
-        *(*SMOKE, "--methods", "hs-ddpg", "--n-demos", 5, "--seeds", 13),
+        *(*SMOKE, "--methods", "me-ddpg", "--n-demos", 5, "--seeds", 13),
         *("--demos", pool, "--devices", 1, "--out", alone),
         **unoptimised,
     )
     assert done.returncode == 0, done.stderr
     assert "13 seeds per cell on 1 CPU device(s)" in done.stdout
-    of_cell = (pl.col("method") == "hs-ddpg") & (pl.col("n_demos") == 5)
+    of_cell = (pl.col("method") == "me-ddpg") & (pl.col("n_demos") == 5)
     for name in TABLES:
         found = pl.read_parquet(folder / name).filter(of_cell)
         assert_frame_equal(found, pl.read_parquet(alone / name), rel_tol=1e-3, abs_tol=1e-3)

@@ -78,12 +78,23 @@ def test_a_port_is_free_again_at_once_when_a_run_has_ended():
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
-def test_a_port_that_is_taken_is_refused(capsys, host):
+def test_a_port_that_is_taken_is_refused(host):
     with socket.create_server((host, 0)) as listener:
         port = listener.getsockname()[1]
-        options = f"--coordinator 127.0.0.1:{port} --processes {PROCESSES} --process-id 0"
-        assert run_grid.main(options.split()) == 2
-    assert capsys.readouterr().err == f"run_grid: --coordinator: port {port} is in use\n"
+        with pytest.raises(UserError, match=f"^--coordinator: port {port} is in use$"):
+            processes._check_port(port)
+
+
+def test_a_command_whose_port_is_taken_is_refused(unoptimised, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        options = (
+            *("--coordinator", f"127.0.0.1:{port}", "--processes", PROCESSES, "--process-id", 0),
+            *("--devices", 1, "--out", tmp_path / "run"),
+        )
+        with Processes(tmp_path, lambda _: unoptimised, lambda _: options, count=1) as run:
+            assert run.codes() == [2]
+            assert run.output(0) == f"run_grid: --coordinator: port {port} is in use\n"
 
 
 def free_port():
