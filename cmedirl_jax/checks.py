@@ -96,6 +96,33 @@ def vectors(name: str, array: Any, size: int) -> None:
     kind(name, array, jnp.floating)
 
 
+def outside(vectors: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Which numbers of `[..., D]` leave their bounds by more than rounding, or are not finite.
+
+    Bounds may be infinite.
+    """
+    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    width = high - low
+    slack = 1e-6 * np.where(np.isfinite(width), width, np.abs([low, high]))
+    inside = (vectors >= low - slack[0]) & (vectors <= high + slack[1])
+    return ~(inside & np.isfinite(vectors))
+
+
+ROUNDINGS = 100.0
+"""Roundings by which two numbers may differ and still count as equal. Steps of Gymnasium's own
+MountainCarContinuous-v0 differ from ours by less than 1."""
+
+
+def tolerance(values: np.ndarray) -> np.ndarray:
+    """How far each number of `[N, D]` may differ: `ROUNDINGS` roundings of float32.
+
+    A rounding counts the number itself and the mean size of its column: what is left of a
+    difference has the rounding of what was subtracted.
+    """
+    size = np.abs(values)
+    return ROUNDINGS * float(np.finfo(np.float32).eps) * (size + size.mean(axis=0))
+
+
 def sizes(**named: int) -> None:
     """Check that static sizes are positive integers.
 
