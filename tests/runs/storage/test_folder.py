@@ -87,6 +87,11 @@ def test_another_configuration_is_refused_naming_the_option_and_both_values(conf
     assert contents(folder) == before
 
 
+def test_what_is_asked_of_the_demonstrations_may_differ(config):
+    folder = opened(config)
+    assert opened(dataclasses.replace(config, check_demos="spec")) == folder
+
+
 def test_methods_numbers_and_seeds_may_differ_and_are_noted_once_the_tables_show_them(config):
     folder = opened(config)
     before = contents(folder)
@@ -105,6 +110,7 @@ def test_what_checkpoints_share_does_not_depend_on_the_cells_asked_for(config):
         return run_folder.identity(validation.describe(dataclasses.replace(config, **changes)))
 
     assert identity(methods=("bc",), n_demos=(1,), seeds=3, checkpoint_every=1.0) == identity()
+    assert identity(check_demos="none") == identity()
     assert identity(seed=1) != identity()
     assert identity()["jax"] == jax.__version__
 
