@@ -101,10 +101,9 @@ def outside(vectors: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarra
 
     Bounds may be infinite.
     """
-    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-    width = high - low
-    slack = 1e-6 * np.where(np.isfinite(width), width, np.abs([low, high]))
-    inside = (vectors >= low - slack[0]) & (vectors <= high + slack[1])
+    bounds = np.array([low, high], np.float64)
+    slack = 1e-6 * np.minimum(bounds[1] - bounds[0], np.maximum(1.0, np.abs(bounds)))
+    inside = (vectors >= bounds[0] - slack[0]) & (vectors <= bounds[1] + slack[1])
     return ~(inside & np.isfinite(vectors))
 
 
@@ -119,7 +118,7 @@ def tolerance(values: np.ndarray) -> np.ndarray:
     A rounding counts the number itself and the mean size of its column: what is left of a
     difference has the rounding of what was subtracted.
     """
-    size = np.abs(values)
+    size = np.abs(values.astype(np.float64))
     return ROUNDINGS * float(np.finfo(np.float32).eps) * (size + size.mean(axis=0))
 
 

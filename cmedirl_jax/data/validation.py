@@ -141,7 +141,7 @@ def _steps(env: Env, params: Any, made: Transition) -> np.ndarray:
     assert env.state_at is not None
     state_at = env.state_at
     observation, action = (x.astype(np.float32) for x in (made.observation, made.action))
-    nudge = 4.0 / checks.ROUNDINGS * checks.tolerance(observation)
+    nudge = (4.0 / checks.ROUNDINGS * checks.tolerance(observation)).astype(np.float32)
 
     def step(observation: jax.Array, action: jax.Array) -> jax.Array:
         state = state_at(observation, params)

@@ -79,7 +79,8 @@ def test_a_step_that_the_task_would_not_make_is_refused(field, row, change, mess
 
 def test_a_pool_of_other_physics_is_refused_at_its_first_step():
     params = ENV.default_params.replace(gravity=1.001 * ENV.default_params.gravity)
-    with pytest.raises(ValueError, match=r"^episode 0, step 0: next_observation\[1\] is 0.001.*e-07"):
+    message = r"^episode 0, step 0: next_observation\[1\] is 0.001\d+, .* \(tolerance 2.9e-07\)$"
+    with pytest.raises(ValueError, match=message):
         demonstrations.check(POOL, ENV, params)
 
 
@@ -107,7 +108,7 @@ def reaching(position):
 
 def test_where_rounding_decides_whether_the_goal_is_reached_both_are_right():
     demonstrations.check(reaching(EDGE - 5e-8), ENV)
-    with pytest.raises(ValueError, match="step 0: reward is 100, .* makes it -?0 "):
+    with pytest.raises(ValueError, match=r"step 0: reward is 100, .* makes it -?0 "):
         demonstrations.check(reaching(EDGE - 5e-6), ENV)
 
 
@@ -124,13 +125,13 @@ def test_a_task_that_cannot_be_set_to_a_state_holds_pools_to_its_specification()
         (
             "observation",
             LAST + 4,
-            lambda seen: seen + [0.0, 0.1],
+            lambda seen: np.add(seen, [0.0, 0.1]),
             r"episode 1, step 3: observation\[1\] is 0.0[89]\d*, .* keeps it in -0.07 to 0.07",
         ),
         (
             "next_observation",
             LAST,
-            lambda seen: seen + [0.2, 0.0],
+            lambda seen: np.add(seen, [0.2, 0.0]),
             rf"episode 0, step {LAST}: next_observation\[0\] is 0.6\d*, .* in -1.2 to 0.6",
         ),
         (
@@ -151,15 +152,12 @@ def test_a_pool_that_leaves_the_bounds_or_jumps_is_refused(field, row, change, m
     demonstrations.validate(changed_at_the_end, SPEC)
 
 
-def test_bounds_may_be_infinite_on_either_side():
-    pool = changed("observation", 0, lambda seen: seen - [7.0, 0.0])
-    pool = pool._replace(episode=np.arange(len(pool.episode)))  # no step follows another
-    pool = pool._replace(truncated=~np.asarray(pool.transition.terminated))
-    largest = np.finfo(np.float32).max
-    for low, high in ((-np.inf, 0.6), (-np.inf, np.inf), (-largest, largest)):
-        bounds = np.array([low, -0.07]), np.array([high, 0.07])
-        demonstrations.validate(
-            pool, SPEC._replace(observation_low=bounds[0], observation_high=bounds[1])
-        )
-    with pytest.raises(ValueError, match=r"observation\[0\] is -7.\d+, .* in -1.2 to inf"):
-        demonstrations.validate(pool, SPEC._replace(observation_high=np.array([np.inf, 0.07])))
+@pytest.mark.parametrize("unbounded", [np.inf, np.finfo(np.float32).max])
+def test_bounds_may_be_infinite_on_either_side(unbounded):
+    pool = changed("observation", 0, lambda seen: np.subtract(seen, [7.0, 0.0]))
+    high = np.array([unbounded, 0.07])
+    wide = SPEC._replace(observation_low=-high, observation_high=high)
+    demonstrations.validate(pool, wide)
+    half = SPEC._replace(observation_high=high)
+    with pytest.raises(ValueError, match=r"observation\[0\] is -7.\d+, .* keeps it in -1.2 to "):
+        demonstrations.validate(pool, half)

@@ -157,13 +157,15 @@ def test_given_parameters_are_checked(env):
 LIMIT = 5
 
 
+def limited(env, steps):
+    """The environment, which truncates after so many steps, whatever its specification says."""
+    return env._replace(default_params=env.default_params.replace(max_episode_steps=steps))
+
+
 @pytest.fixture
 def short(env):
-    """The environment, which ends its episodes at its limit of `LIMIT` steps."""
-    return env._replace(
-        spec=env.spec._replace(max_episode_steps=LIMIT),
-        default_params=env.default_params.replace(max_episode_steps=LIMIT),
-    )
+    """The environment with a limit of `LIMIT` steps."""
+    return limited(env._replace(spec=env.spec._replace(max_episode_steps=LIMIT)), LIMIT)
 
 
 def test_an_environment_that_keeps_to_its_specification_passes(short):
@@ -181,7 +183,7 @@ def at_rest(env):
     ("spoil", "message"),
     [
         (
-            lambda env: env._replace(default_params=env.default_params.replace(max_episode_steps=6)),
+            lambda env: limited(env, LIMIT + 1),
             "an episode goes on after 5 steps, its specification's max_episode_steps",
         ),
         (
