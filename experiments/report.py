@@ -4,7 +4,7 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import polars as pl
 import tyro
@@ -70,7 +70,7 @@ def report(folder: Path, redraw: bool = False) -> pl.DataFrame:
     path, content = folder / "summary.csv", summary.write_csv().encode()
     same = path.is_file() and path.read_bytes() == content
     if redraw or not same or not (folder / "figures").exists():
-        _draw(folder, config, run_tables, summary, threshold)
+        _draw(folder, run_tables, summary, threshold)
     tables.write_if_other(path, content)
     return summary
 
@@ -100,12 +100,11 @@ def summarise(
 
 def _draw(
     folder: Path,
-    config: dict[str, Any],
     run_tables: dict[str, pl.DataFrame],
     summary: pl.DataFrame,
     threshold: float,
 ) -> None:
-    pool = stored_demonstrations.load(folder, envs.make(config["env"]).spec)
+    pool = stored_demonstrations.load(folder)
     expert = None if pool is None else float(demonstrations.returns(pool).mean())
     figures.draw(
         folder / "figures",

@@ -392,6 +392,11 @@ def test_positive_numbers_are_finite(wrong):
         checks.positive(scale=wrong)
 
 
+def test_what_is_left_of_a_difference_may_differ_by_what_was_subtracted():
+    exact, rounded = np.sin([[np.pi]]), np.sin(np.float32([[np.pi]]))
+    assert 0.0 < np.abs(exact - rounded) <= checks.tolerance(exact) < 2e-7
+
+
 def test_traced_values_pass():
     def check(number):
         checks.sizes(number=number)

@@ -15,13 +15,14 @@ import numpy as np
 
 from cmedirl_jax import checks
 from cmedirl_jax.data.formats import load, save
-from cmedirl_jax.data.validation import validate
+from cmedirl_jax.data.validation import check, validate
 from cmedirl_jax.types import Demonstrations, DemonstrationSubset, Numeric, Transition
 
 __all__ = [
     "DemonstrationSubset",
     "Demonstrations",
     "at",
+    "check",
     "discounted_returns",
     "episodes",
     "load",

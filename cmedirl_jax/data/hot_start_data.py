@@ -33,7 +33,7 @@ def prepare(
     limit cut it off.
 
     Args:
-        demonstrations: the pool.
+        demonstrations: the pool, one that `demonstrations.validate` accepts.
         discount: per environment step.
         reward_scale: factor on every reward.
 

@@ -1,22 +1,39 @@
 """Whether a pool of demonstrations is what it claims to be, on the host, where it enters."""
 
+from typing import Any
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.types import Demonstrations, EnvSpec
+from cmedirl_jax import checks
+from cmedirl_jax.envs import Env
+from cmedirl_jax.types import Demonstrations, EnvSpec, Transition
 
 
 def validate(demonstrations: Demonstrations, spec: EnvSpec | None = None) -> None:
-    """Check a pool, against an environment if `spec` is given.
+    """Check a pool, against a task's specification if `spec` is given.
 
     Raises:
-        ValueError: naming the first mistake: another environment, wrong shapes or dtypes, no
-            steps, values that are not finite, actions out of bounds, episodes out of order.
+        ValueError: naming the first mistake: wrong shapes or dtypes, no steps, values that are not
+            finite, episodes out of order. With `spec` also: another environment, observations or
+            actions out of bounds, or a `next_observation` that is not the following step's
+            observation in the same episode.
     """
     transition, truncated, episode, metadata = demonstrations
     if spec is not None and metadata.get("env") != spec.id:
         raise ValueError(f"made for environment {metadata.get('env')!r}, not {spec.id!r}")
     arrays = {**transition._asdict(), "truncated": truncated, "episode": episode}
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
+    _validate_arrays(arrays)
+    _validate_episodes(arrays)
+    if spec is not None:
+        _validate_sizes(arrays, spec)
+        _validate_bounds(arrays, spec)
+        _validate_continuity(arrays)
+
+
+def _validate_arrays(arrays: dict[str, np.ndarray]) -> None:
     size = arrays["reward"].shape
     if len(size) != 1 or size[0] == 0:
         raise ValueError(f"reward must be [N] with N > 0, got shape {size}")
@@ -31,8 +48,9 @@ def validate(demonstrations: Demonstrations, spec: EnvSpec | None = None) -> Non
             raise ValueError(f"{name} holds values that are not finite")
     if arrays["observation"].shape != arrays["next_observation"].shape:
         raise ValueError("observation and next_observation differ in shape")
-    if spec is not None:
-        _validate_sizes(arrays, spec)
+
+
+def _validate_episodes(arrays: dict[str, np.ndarray]) -> None:
     change = np.diff(arrays["episode"].astype(np.int64))
     if arrays["episode"][0] != 0 or not np.isin(change, (0, 1)).all():
         raise ValueError("episode must count 0, 0, ..., 1, 1, ... without gaps")
@@ -45,7 +63,96 @@ def _validate_sizes(arrays: dict[str, np.ndarray], spec: EnvSpec) -> None:
     for name, dim in (("observation", spec.observation_dim), ("action", spec.action_dim)):
         if arrays[name].shape[1] != dim:
             raise ValueError(f"{name} has {arrays[name].shape[1]} dimensions, {spec.id} has {dim}")
-    tolerance = 1e-6 * (spec.action_high - spec.action_low)
-    below = arrays["action"] < spec.action_low - tolerance
-    if (below | (arrays["action"] > spec.action_high + tolerance)).any():
-        raise ValueError(f"action leaves the bounds {spec.action_low} to {spec.action_high}")
+
+
+def _validate_bounds(arrays: dict[str, np.ndarray], spec: EnvSpec) -> None:
+    for name in ("action", "observation", "next_observation"):
+        of = name.removeprefix("next_")
+        low, high = getattr(spec, f"{of}_low"), getattr(spec, f"{of}_high")
+        outside = checks.outside(arrays[name], low, high)
+        if outside.any():
+            row, column = np.argwhere(outside)[0]
+            raise ValueError(
+                f"{_place(arrays['episode'], row)}: {name}[{column}] is "
+                f"{arrays[name][row, column]:.7g}, {spec.id} keeps it in "
+                f"{low[column]:.7g} to {high[column]:.7g}"
+            )
+
+
+def _validate_continuity(arrays: dict[str, np.ndarray]) -> None:
+    before = np.flatnonzero(np.diff(arrays["episode"]) == 0)
+    tolerance = checks.tolerance(arrays["next_observation"])[before]
+    found = arrays["next_observation"][before].astype(np.float64)
+    following = arrays["observation"][before + 1]
+    wrong = np.argwhere(np.abs(found - following) > tolerance)
+    if wrong.size:
+        row, column = wrong[0]
+        raise ValueError(
+            f"{_place(arrays['episode'], int(before[row]))}: next_observation[{column}] is "
+            f"{found[row, column]:.7g}, the following step's observation is "
+            f"{following[row, column]:.7g} (tolerance {tolerance[row, column]:.1e})"
+        )
+
+
+def check(demonstrations: Demonstrations, env: Env, params: Any = None) -> None:
+    """Check a pool as `validate` does, and each of its steps against the task's own.
+
+    Where the task can be set to an observation (`env.state_at`), `env.step` says what follows from
+    each observation and action. Elsewhere this is `validate`. A task that draws random numbers in
+    `step` cannot be checked so: use `validate`. Rounding may decide whether an episode ends, so a
+    step also passes if it is the task's answer to an observation a few roundings away.
+
+    Args:
+        demonstrations: the pool.
+        env: the task.
+        params: its parameters, default `env.default_params`.
+
+    Raises:
+        ValueError: as `validate`, or for the first step that is not the task's, naming the episode,
+            the step, the field, its value, the task's value and the tolerance.
+    """
+    validate(demonstrations, env.spec)
+    if env.state_at is None:
+        return
+    made = jax.tree.map(np.asarray, demonstrations.transition)
+    found = np.column_stack([made.next_observation, made.reward, made.terminated])
+    expected = _steps(env, env.default_params if params is None else params, made)
+    tolerance = checks.tolerance(found)
+    # NaN agrees with nothing.
+    differs = ~(np.abs(found - expected) <= tolerance)
+    wrong = np.flatnonzero(differs.any(axis=-1).all(axis=0))
+    if wrong.size:
+        row = wrong[0]
+        column = np.flatnonzero(differs[0, row])[0]
+        names = [f"next_observation[{i}]" for i in range(env.spec.observation_dim)]
+        raise ValueError(
+            f"{_place(np.asarray(demonstrations.episode), row)}: "
+            f"{[*names, 'reward', 'terminated'][column]} is {found[row, column]:.7g}, "
+            f"{env.spec.id} makes it {expected[0, row, column]:.7g} "
+            f"(tolerance {tolerance[row, column]:.1e})"
+        )
+
+
+def _steps(env: Env, params: Any, made: Transition) -> np.ndarray:
+    """What the task answers to each observation, and to two a few roundings away.
+
+    Next observation, reward and terminated side by side, `[3, N, O + 2]`.
+    """
+    assert env.state_at is not None
+    state_at = env.state_at
+    observation, action = (x.astype(np.float32) for x in (made.observation, made.action))
+    nudge = (4.0 / checks.ROUNDINGS * checks.tolerance(observation)).astype(np.float32)
+
+    def step(observation: jax.Array, action: jax.Array) -> jax.Array:
+        state = state_at(observation, params)
+        answer = env.step(jax.random.key(0), state, action, params)[1]
+        return jnp.concatenate([answer.observation, jnp.stack([answer.reward, answer.terminated])])
+
+    def nudged(sign: jax.Array) -> jax.Array:
+        return jax.vmap(step)(observation + sign * nudge, action)
+
+    return np.asarray(jax.lax.map(nudged, np.array([0.0, -1.0, 1.0], np.float32)), np.float64)
+
+
+def _place(episode: np.ndarray, row: Any) -> str:
+    return f"episode {episode[row]}, step {row - np.searchsorted(episode, episode[row])}"

@@ -1,6 +1,7 @@
 """Environments as pure functions."""
 
-from cmedirl_jax.envs.base import Env, Step, check
+from cmedirl_jax.envs.base import Env, Step
 from cmedirl_jax.envs.registry import ENVS, make, register
+from cmedirl_jax.envs.validation import check
 
 __all__ = ["ENVS", "Env", "Step", "check", "make", "register"]

@@ -16,9 +16,13 @@ def make(id: str) -> Env:
     """Make an environment by its name.
 
     Raises:
-        ValueError: if there is no such environment; the message lists those there are.
+        ValueError: if there is no such environment; the message lists those there are. If the
+            environment gives itself another name.
     """
-    return ENVS[id]()
+    env = ENVS[id]()
+    if env.spec.id != id:
+        raise ValueError(f"environment {id!r}: the id in its specification is {env.spec.id!r}")
+    return env
 
 
 def register(id: str, make: Callable[[], Env]) -> None:

@@ -13,6 +13,7 @@ from cmedirl_jax.training.methods import PAPER_METHODS
 from cmedirl_jax.training.settings import Settings
 
 Expert = Literal["best", "median", "all"]
+DemosCheck = Literal["dynamics", "spec", "none"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +55,10 @@ class StudyConfig:
             alike.
         demos: A demonstrations file to learn from; no experts are trained, and their options are
             not read.
+        check_demos: What is asked of that file. dynamics: that each step is the task's own, where
+            the task can be set to an observation; spec: the task's name and bounds, and that steps
+            follow each other, for tasks that draw random numbers; none: the task's sizes, for
+            noisy demonstrations or those of another task.
         env: The environment, by Gymnasium's name.
         devices: CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU.
             With several processes, of each of them.
@@ -82,6 +87,7 @@ class StudyConfig:
     out: Path | None = None
     expert: Expert = "best"
     demos: Path | None = None
+    check_demos: DemosCheck = "dynamics"
     env: str = "MountainCarContinuous-v0"
     devices: Size | None = None
     group: Size | None = None

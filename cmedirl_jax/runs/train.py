@@ -143,7 +143,7 @@ def train_cells(session: Session, todo: Sequence[Cell]) -> None:
 
     def load_stored() -> Demonstrations | None:
         with run_folder.naming_the_option():
-            return stored_demonstrations.load(plan.folder, plan.env.spec)
+            return stored_demonstrations.load(plan.folder)
 
     # The demonstrations, and how many steps there are to train.
     stored = cluster.pool_from_writer(load_stored)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from cmedirl_jax import envs, networks, ranges
+from cmedirl_jax import checks, envs, networks, ranges
 from cmedirl_jax.agents.exploration import ExplorationSettings
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
@@ -15,7 +15,7 @@ from cmedirl_jax.envs import Env
 from cmedirl_jax.irl import rewards
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.cluster.base import ALONE, Cluster
-from cmedirl_jax.runs.config import Expert, ExpertSettings, StudyConfig
+from cmedirl_jax.runs.config import DemosCheck, Expert, ExpertSettings, StudyConfig
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import cells, plain
 from cmedirl_jax.tabular import imitation
@@ -89,7 +89,9 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE) -> Plan:
     asked = cells.asked(config.methods, config.n_demos)
     path, demos = config.demos, None
     if path is not None:
-        demos = cluster.pool_from_writer(lambda: load_demonstrations(path, env, asked))
+        demos = cluster.pool_from_writer(
+            lambda: load_demonstrations(path, env, asked, config.check_demos)
+        )
     return Plan(
         folder=config.folder,
         config=cluster.from_writer(lambda: describe(config)),
@@ -145,7 +147,8 @@ def check(config: StudyConfig) -> None:
             raise UserError(f"--methods: unknown method {method!r}; there are {', '.join(METHODS)}")
     try:
         env = envs.make(config.env)
-    except ValueError as error:
+        envs.check(env, steps=0)
+    except (TypeError, ValueError) as error:
         raise UserError(f"--env: {error}") from error
     for name in ("methods", "n_demos"):
         values = getattr(config, name)
@@ -204,19 +207,22 @@ def _check_epsilon(settings: ExplorationSettings) -> None:
         raise UserError(f"--exploration.hot-start-factor: makes epsilon {largest:g}, above 1")
 
 
-def load_demonstrations(path: Path, env: Env, asked: Sequence[tuple[str, int]]) -> Demonstrations:
+def load_demonstrations(
+    path: Path, env: Env, asked: Sequence[tuple[str, int]], check: DemosCheck
+) -> Demonstrations:
     """Read the file that `--demos` names.
 
     Args:
         path: the file.
         env: the task.
         asked: method and number of demonstrations of each cell.
+        check: what is asked of the demonstrations, see `StudyConfig`.
 
     Raises:
         UserError: if it is missing, damaged, foreign, or holds too few.
     """
     try:
-        pool = demonstrations.load(path, env.spec)
+        pool = demonstrations.load(path)
     except FileNotFoundError as error:
         raise UserError(
             f"--demos: there is no file {path}; give one that demonstrations.save wrote"
@@ -225,6 +231,18 @@ def load_demonstrations(path: Path, env: Env, asked: Sequence[tuple[str, int]]) 
         raise UserError(f"--demos: {path}: {error.strerror}") from error
     except ValueError as error:
         raise UserError(f"--demos: {error}") from error
+    try:
+        match check:
+            case "dynamics":
+                demonstrations.check(pool, env)
+            case "spec":
+                demonstrations.validate(pool, env.spec)
+            case "none":
+                checks.transition_shapes(
+                    env.spec, pool.transition, pool.episode.shape, "transition"
+                )
+    except ValueError as error:
+        raise UserError(f"--demos: {path}: {error}; see --check-demos") from error
     # The tables have a column of each.
     expert = pool.metadata.get("expert", "")
     if not isinstance(expert, str):

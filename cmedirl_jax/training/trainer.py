@@ -100,7 +100,7 @@ def make(
         raise ValueError(f"{method.name} does not act: there is nothing to train")
     settings = settings or Settings()
     env_params = env.default_params if env_params is None else env_params
-    envs.check(env, env_params)
+    envs.check(env, env_params, steps=0)
     algorithm = compose.compose(env.spec, method, settings, capacity)
     beginning = initialise.make(
         env, method, settings, algorithm, env_params=env_params, subset_size=subset_size

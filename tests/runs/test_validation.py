@@ -1,13 +1,16 @@
 import dataclasses
 import typing
 
+import numpy as np
 import pytest
 
-from cmedirl_jax import ranges
+from cmedirl_jax import envs, ranges
+from cmedirl_jax.data import demonstrations
 from cmedirl_jax.runs import validation
 from cmedirl_jax.runs.errors import UserError
 from experiments.presets import PRESETS
 from experiments.run_grid import parse
+from tests.support import pools
 
 
 def fields(options, prefix=""):
@@ -65,3 +68,49 @@ def test_a_number_out_of_range_is_refused_naming_its_option(name, word):
     assert message.startswith(f"{option}: must be ")
     number = message.rpartition(", got ")[2]
     assert str(float(number)) == str(float(word))
+
+
+POOL = pools.scripted(2)
+UNREWARDED = POOL.transition._replace(reward=np.zeros_like(POOL.transition.reward))
+BESIDE = POOL.transition._replace(observation=POOL.transition.observation + np.float32([0, 0.1]))
+
+
+@pytest.mark.parametrize(
+    ("pool", "refused_by"),
+    [
+        (POOL, ()),
+        (POOL._replace(transition=UNREWARDED), ("dynamics",)),
+        (POOL._replace(transition=BESIDE), ("dynamics", "spec")),
+        (POOL._replace(metadata={"env": "Other-v1"}), ("dynamics", "spec")),
+        (
+            POOL._replace(transition=POOL.transition._replace(action=np.zeros((999, 2)))),
+            ("dynamics", "spec", "none"),
+        ),
+    ],
+    ids=["the task's", "without rewards", "out of bounds", "of another task", "of other sizes"],
+)
+def test_demonstrations_are_held_to_the_task_as_far_as_check_demos_says(tmp_path, pool, refused_by):
+    path = tmp_path / "pool.npz"
+    size = len(pool.episode)
+    action = pool.transition.action[:size]
+    demonstrations.save(path, pool._replace(transition=pool.transition._replace(action=action)))
+    for level in ("dynamics", "spec", "none"):
+        asked = {"methods": ("bc",), "n_demos": (2,), "demos": path, "check_demos": level}
+        config = dataclasses.replace(PRESETS["tuned"], **asked)
+        if level in refused_by:
+            with pytest.raises(UserError) as error:
+                validation.plan(config)
+            assert str(error.value).startswith(f"--demos: {path}: ")
+            assert str(error.value).endswith("; see --check-demos")
+        else:
+            assert validation.plan(config).demos is not None
+
+
+def test_a_task_that_does_not_keep_to_its_specification_is_refused(monkeypatch):
+    env = envs.make("MountainCarContinuous-v0")
+    own = env._replace(
+        spec=env.spec._replace(id="Own-v0"), reset=lambda key, params: (0, np.zeros(3))
+    )
+    monkeypatch.setitem(envs.ENVS, "Own-v0", lambda: own)
+    with pytest.raises(UserError, match=r"^--env: Own-v0: observation of reset: .*\(3,\)"):
+        validation.check(dataclasses.replace(PRESETS["tuned"], env="Own-v0"))

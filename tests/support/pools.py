@@ -46,7 +46,7 @@ episode_lengths = st.lists(st.integers(1, 6), min_size=1, max_size=8)
 
 
 def random_pool(lengths, seed=0, last_unfinished=False):
-    """Episodes of the given lengths, every other one truncated, of random numbers."""
+    """Episodes of the given lengths, every other one truncated, of random numbers in bounds."""
     rng = np.random.default_rng(seed)
     steps = sum(lengths)
     episode = np.repeat(np.arange(len(lengths), dtype=np.int32), lengths)
@@ -55,8 +55,10 @@ def random_pool(lengths, seed=0, last_unfinished=False):
     def uniform(*shape):
         return rng.uniform(-1, 1, (steps, *shape)).astype(np.float32)
 
+    observation = uniform(2) * ENV.spec.observation_high
+    following = np.where(last[:, None], 0.5 * observation, np.roll(observation, -1, axis=0))
     return Demonstrations(
-        Transition(uniform(2), uniform(1), uniform(), uniform(2), last & (episode % 2 == 0)),
+        Transition(observation, uniform(1), uniform(), following, last & (episode % 2 == 0)),
         truncated=last & (episode % 2 == 1),
         episode=episode,
         metadata={"env": ENV.spec.id, "expert": "scripted", "seeds": [1, 2]},

@@ -137,6 +137,8 @@ def record(
 ) -> tuple[Transition, jax.Array, jax.Array]:
     """Record `episodes` noise-free episodes side by side from random starts.
 
+    An episode that the task has not ended after `env.spec.max_episode_steps` steps is cut there.
+
     Returns:
         Transitions `[episodes, max_episode_steps, ...]`, whether the episode was still running at
         that step, and whether the time limit cut it off there.
@@ -155,8 +157,9 @@ def record(
         transition = Transition(
             observations, actions, step.reward, step.observation, step.terminated
         )
-        truncated = step.truncated & ~step.terminated
-        ended = step.terminated | step.truncated
+        at_limit = time + 1 >= env.spec.max_episode_steps
+        truncated = (step.truncated | at_limit) & ~step.terminated
+        ended = step.terminated | truncated
         return (states, step.observation, running & ~ended), (transition, running, truncated)
 
     carry = (states, observations, jnp.ones(episodes, bool))

@@ -30,7 +30,10 @@ def replay(evaluator: Evaluator, actors: Any, env: Env) -> Replay:
 
 
 def _run(act: Callable[[jax.Array], jax.Array], actors: Any, env: Env) -> np.ndarray:
-    """Step all seeds' Gymnasium environments side by side; returns `[seeds, STARTS]`."""
+    """Step all seeds' Gymnasium environments side by side; returns `[seeds, STARTS]`.
+
+    Episodes are cut after `env.spec.max_episode_steps` steps, as in JAX.
+    """
     count = jax.tree.leaves(actors)[0].shape[0]
     _, observations = env.starts(STARTS, env.default_params)
     environments = [[gymnasium.make(env.spec.id) for _ in range(STARTS)] for _ in range(count)]
@@ -42,7 +45,9 @@ def _run(act: Callable[[jax.Array], jax.Array], actors: Any, env: Env) -> np.nda
             environment.unwrapped.state = observation.copy()  # type: ignore[attr-defined]
     returns = np.zeros((count, STARTS))
     running = np.ones((count, STARTS), bool)
-    while running.any():
+    for _ in range(env.spec.max_episode_steps):
+        if not running.any():
+            break
         actions = np.asarray(act(jnp.asarray(current)))
         for seed, start in zip(*np.nonzero(running), strict=True):
             observation, reward, terminated, truncated, _ = environments[seed][start].step(

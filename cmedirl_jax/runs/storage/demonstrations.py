@@ -6,7 +6,6 @@ from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import sealing
-from cmedirl_jax.types import EnvSpec
 
 FOLDER, FILE = "demonstrations", "pool.npz"
 
@@ -17,8 +16,10 @@ def save(folder: Path, pool: Demonstrations) -> None:
         demonstrations.save(unfinished / FILE, pool)
 
 
-def load(folder: Path, spec: EnvSpec) -> Demonstrations | None:
+def load(folder: Path) -> Demonstrations | None:
     """The demonstrations that the run keeps, or None if it keeps none yet.
+
+    They were held to the task before they were kept.
 
     Raises:
         UserError: if they are not as they were written.
@@ -28,7 +29,7 @@ def load(folder: Path, spec: EnvSpec) -> Demonstrations | None:
         return None
     try:
         sealing.read(path)
-        return demonstrations.load(path / FILE, spec)
+        return demonstrations.load(path / FILE)
     except sealing.Damaged as error:
         raise UserError(
             f"{path} {error}; bring it back, or remove it to train the experts again"

@@ -28,7 +28,7 @@ CELLS_ASKED = ("methods", "n_demos", "seeds")
 _LOCK = ".lock"
 _NOT_COMPARED = (
     *("out", "devices", "distributed", "coordinator", "processes", "process_id"),
-    *("checkpoint_every", *CELLS_ASKED),
+    *("checkpoint_every", "check_demos", *CELLS_ASKED),
 )
 
 

@@ -121,6 +121,19 @@ def test_reaching_the_goal_at_the_last_step_is_no_truncation(env):
     assert not truncated.any()
 
 
+def test_an_episode_that_the_task_does_not_end_is_truncated_at_the_specifications_limit(env):
+    params = env.default_params.replace(max_episode_steps=10**6)
+    endless = env._replace(
+        spec=env.spec._replace(max_episode_steps=4), default_params=params, state_at=None
+    )
+    recorded = jax.jit(lambda key: experts.record(act, endless, STRENGTHS[1], key, 2))
+    pool = experts.flatten(
+        *jax.tree.map(np.asarray, recorded(jax.random.key(0))), {"env": env.spec.id}
+    )
+    demonstrations.validate(pool, endless.spec)
+    np.testing.assert_array_equal(pool.truncated, [False, False, False, True] * 2)
+
+
 @pytest.fixture
 def make_pool(env, monkeypatch):
     """`make_pool` with the scripted policies in the place of trained experts.

@@ -1,4 +1,7 @@
+import types
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax import networks
@@ -25,3 +28,15 @@ def test_policies_return_in_gymnasium_what_they_return_in_jax(env, spec):
     np.testing.assert_allclose(found.gymnasium_return, found.jax_return, atol=1e-3)
     assert (found.gymnasium_return[0] < 0.0).all()
     assert (found.gymnasium_return[1] > 90.0).all()
+
+
+def test_episodes_are_cut_at_the_specifications_limit(env):
+    short = env._replace(spec=env.spec._replace(max_episode_steps=7))
+    evaluator = types.SimpleNamespace(
+        act=lambda actor, observations: jnp.broadcast_to(actor, (*observations.shape[:-1], 1)),
+        on_starts=lambda actors, count: types.SimpleNamespace(episode_return=None),
+        gather=lambda arrays: arrays,
+    )
+    found = gymnasium_replay.replay(evaluator, np.array([0.0, -1.0], np.float32), short)
+    expected = [[0.0] * gymnasium_replay.STARTS, [-0.7] * gymnasium_replay.STARTS]
+    np.testing.assert_allclose(found.gymnasium_return, expected, rtol=1e-6)

@@ -105,6 +105,11 @@ def test_another_configuration_is_refused_naming_the_option_and_both_values(conf
     assert contents(folder) == before
 
 
+def test_what_is_asked_of_the_demonstrations_may_differ(config):
+    folder = begun(config)
+    assert opened(dataclasses.replace(config, check_demos="spec")) == folder
+
+
 @pytest.mark.parametrize("saved", ["cell", "checkpoint", "demonstrations"])
 def test_what_training_has_saved_keeps_its_configuration(config, saved):
     folder = begun(config, saved)
@@ -161,6 +166,7 @@ def test_what_checkpoints_share_does_not_depend_on_the_cells_asked_for(config):
         return run_folder.identity(validation.describe(dataclasses.replace(config, **changes)))
 
     assert identity(methods=("bc",), n_demos=(1,), seeds=3, checkpoint_every=1.0) == identity()
+    assert identity(check_demos="none") == identity()
     assert identity(seed=1) != identity()
     assert identity()["jax"] == jax.__version__
 

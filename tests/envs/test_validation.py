@@ -66,6 +66,11 @@ def starting(env, change):
             "observation of reset: expected floats, got int32",
         ),
         (
+            lambda env: resetting(env, lambda seen: seen.astype(jnp.float16)),
+            TypeError,
+            "observation of step: is float32, that of reset float16",
+        ),
+        (
             lambda env: stepping(env, observation=lambda answer: answer.observation[None]),
             ValueError,
             r"observation of step: expected shape \(2,\), got \(1, 2\)",
@@ -144,6 +149,81 @@ def test_given_parameters_are_checked(env):
         step,
         lambda count, params: env.starts(count, env.default_params),
     )
-    envs.check(given)
+    envs.check(given, steps=0)
     with pytest.raises(ValueError, match=r"reward: expected shape \(\), got \(3,\)"):
         envs.check(given, Params(np.zeros(3, np.float32)))
+
+
+LIMIT = 5
+
+
+def limited(env, steps):
+    """The environment, which truncates after so many steps, whatever its specification says."""
+    return env._replace(default_params=env.default_params.replace(max_episode_steps=steps))
+
+
+@pytest.fixture
+def short(env):
+    """The environment with a limit of `LIMIT` steps."""
+    return limited(env._replace(spec=env.spec._replace(max_episode_steps=LIMIT)), LIMIT)
+
+
+def test_an_environment_that_keeps_to_its_specification_passes(short):
+    envs.check(short)
+
+
+def at_rest(env):
+    """The environment, whose `state_at` forgets the velocity."""
+    return env._replace(
+        state_at=lambda seen, params: env.state_at(seen * jnp.array([1.0, 0.0]), params)
+    )
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (
+            lambda env: limited(env, LIMIT + 1),
+            "an episode goes on after 5 steps, its specification's max_episode_steps",
+        ),
+        (
+            lambda env: stepping(env, observation=lambda answer: answer.observation + 2.0),
+            r"observation\[0\] of step is 1\.[3-6]\d* at step 0, .* keeps it in -1.2 to 0.6",
+        ),
+        (
+            lambda env: stepping(env, observation=lambda answer: answer.observation * jnp.nan),
+            r"observation\[0\] of step is nan at step 0",
+        ),
+        (
+            lambda env: stepping(env, reward=lambda answer: answer.reward / 0.0),
+            "reward is -inf at step 0",
+        ),
+        (
+            lambda env: resetting(env, lambda seen: seen - jnp.array([0.0, 0.1])),
+            r"observation\[1\] of reset is -0.1 at step 0, its .* keeps it in -0.07 to 0.07",
+        ),
+        (
+            lambda env: starting(env, lambda states, seen: (states, seen * jnp.inf)),
+            r"observation\[0\] of starts is -inf at step 0",
+        ),
+        (
+            at_rest,
+            r"observation of step 1 is -0.\d+, from state_at of the observation before -0.",
+        ),
+    ],
+)
+def test_an_environment_that_breaks_its_specification_in_play_is_refused(short, spoil, message):
+    spoilt = spoil(short)
+    envs.check(spoilt, steps=0)
+    with pytest.raises(ValueError, match=rf"^MountainCarContinuous-v0: {message}"):
+        envs.check(spoilt)
+
+
+def test_what_a_task_answers_after_an_episodes_end_is_not_asked(short):
+    def step(key, state, action, params):
+        state, answer = short.step(key, state, action, params)
+        return state, answer._replace(
+            reward=jnp.where(state.time > 3, jnp.nan, answer.reward), truncated=state.time >= 3
+        )
+
+    envs.check(short._replace(step=step))
