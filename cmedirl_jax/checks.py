@@ -1,13 +1,19 @@
-"""Checks of arguments by name. They run while tracing and cost nothing in a compiled program."""
+"""Checks of arguments by name. They run while tracing and cost nothing in a compiled program.
 
-import math
+Shapes and dtypes are always checked. Values are checked where they are known on the host: those of
+traced arrays pass.
+"""
+
+import operator
 from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.types import EnvSpec, Numeric, Transition
+from cmedirl_jax import ranges
+from cmedirl_jax.ranges import Range
+from cmedirl_jax.types import Array, EnvSpec, Numeric, Transition
 
 _KINDS = {
     jnp.floating: "floats",
@@ -118,37 +124,43 @@ def counts(**named: int) -> None:
 
 def _at_least(low: int, named: Mapping[str, int]) -> None:
     for name, size in named.items():
-        if isinstance(size, float | np.floating):
-            raise TypeError(f"{name}: expected an integer, got {size}")
-        if _known(size) and size < low:
+        if not ranges.known(size):
+            continue
+        try:
+            number = operator.index(size)
+        except TypeError:
+            raise TypeError(f"{name}: expected an integer, got {size}") from None
+        if number < low:
             raise ValueError(f"{name} must be at least {low}, got {size}")
 
 
 def shares(**named: Numeric) -> None:
-    """Check that numbers are between 0 and 1. Arrays pass, as their values may be unknown.
+    """Check that numbers are between 0 and 1.
 
     Raises:
         ValueError: naming the first that is not.
     """
-    for name, share in named.items():
-        if _known(share) and not 0.0 <= share <= 1.0:
-            raise ValueError(f"{name} must be between 0 and 1, got {share}")
+    within(ranges.SHARE, **named)
 
 
 def positive(**named: Numeric) -> None:
-    """Check that numbers are positive and finite. Arrays pass, as their values may be unknown.
+    """Check that numbers are positive and finite.
 
     Raises:
         ValueError: naming the first that is not.
     """
-    for name, number in named.items():
-        if _known(number) and not 0.0 < number < math.inf:
-            raise ValueError(f"{name} must be positive and finite, got {number}")
+    within(ranges.POSITIVE, **named)
 
 
-def _known(number: Any) -> bool:
-    """Whether it is a number on the host, not an array that may be traced."""
-    return isinstance(number, int | float | np.number)
+def within(interval: Range, **named: Numeric | Array) -> None:
+    """Check that numbers, or all entries of arrays, lie in an interval.
+
+    Raises:
+        ValueError: naming the first that does not, what it must be, what it is and where.
+    """
+    for name, values in named.items():
+        if wrong := ranges.outside(interval, values):
+            raise ValueError(f"{name} {wrong}")
 
 
 def env_spec(spec: EnvSpec) -> None:

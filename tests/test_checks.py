@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmedirl_jax import checks, irl, tabular
+from cmedirl_jax import checks, irl, ranges, tabular
 from cmedirl_jax.agents import ddpg, exploration, hot_start
 from cmedirl_jax.agents.exploration import EpsilonGreedyHParams
 from cmedirl_jax.data import demonstrations, episodes, replay
@@ -372,10 +372,11 @@ def test_a_horizon_of_zero_is_refused(solve):
 @pytest.mark.parametrize("check", [checks.sizes, checks.counts])
 def test_sizes_are_whole_numbers(check):
     check(size=1, other=np.int64(3))
-    with pytest.raises(TypeError, match=r"size: expected an integer, got 2\.5"):
-        check(size=2.5)
+    for wrong in (2.5, np.float32(2.5), jnp.float32(2.5), "2.5"):
+        with pytest.raises(TypeError, match=r"size: expected an integer, got 2\.5"):
+            check(size=wrong)
     with pytest.raises(ValueError, match=r"size must be at least \d, got -1"):
-        check(size=np.int64(-1))
+        check(size=jnp.int32(-1))
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.1, float("nan"), np.float32(2.0)])
@@ -392,11 +393,18 @@ def test_positive_numbers_are_finite(wrong):
         checks.positive(scale=wrong)
 
 
+def test_every_entry_of_an_array_on_the_host_is_checked():
+    checks.within(ranges.SHARE, grid=np.array([[0.0, 1.0]]))
+    with pytest.raises(ValueError, match=r"^grid must be between 0 and 1, got 2\.0 at \[1, 0\]$"):
+        checks.within(ranges.SHARE, grid=jnp.array([[0.0, 1.0], [2.0, jnp.nan]]))
+
+
 def test_traced_values_pass():
     def check(number):
         checks.sizes(number=number)
         checks.shares(number=number)
         checks.positive(number=number)
+        checks.within(ranges.SHARE, number=number)
         return number
 
     assert jax.jit(check)(-5) == -5
