@@ -102,7 +102,7 @@ def vectors(name: str, array: Any, size: int) -> None:
     kind(name, array, jnp.floating)
 
 
-def sizes(**named: int) -> None:
+def sizes(**named: Numeric) -> None:
     """Check that static sizes are positive integers.
 
     Raises:
@@ -112,7 +112,7 @@ def sizes(**named: int) -> None:
     _at_least(1, named)
 
 
-def counts(**named: int) -> None:
+def counts(**named: Numeric) -> None:
     """Check that static counts are integers and not negative.
 
     Raises:
@@ -122,7 +122,7 @@ def counts(**named: int) -> None:
     _at_least(0, named)
 
 
-def _at_least(low: int, named: Mapping[str, int]) -> None:
+def _at_least(low: int, named: Mapping[str, Any]) -> None:
     for name, size in named.items():
         if not ranges.known(size):
             continue
@@ -134,7 +134,7 @@ def _at_least(low: int, named: Mapping[str, int]) -> None:
             raise ValueError(f"{name} must be at least {low}, got {size}")
 
 
-def shares(**named: Numeric) -> None:
+def shares(**named: Numeric | Array) -> None:
     """Check that numbers are between 0 and 1.
 
     Raises:
@@ -143,7 +143,7 @@ def shares(**named: Numeric) -> None:
     within(ranges.SHARE, **named)
 
 
-def positive(**named: Numeric) -> None:
+def positive(**named: Numeric | Array) -> None:
     """Check that numbers are positive and finite.
 
     Raises:
@@ -161,6 +161,18 @@ def within(interval: Range, **named: Numeric | Array) -> None:
     for name, values in named.items():
         if wrong := ranges.outside(interval, values):
             raise ValueError(f"{name} {wrong}")
+
+
+def indices(size: int, **named: Array) -> None:
+    """Check that integers index an axis of length `size`, from its beginning.
+
+    Raises:
+        ValueError: naming the first that is negative or not below `size`.
+        TypeError: if they are not integers.
+    """
+    for name, values in named.items():
+        kind(name, values, jnp.integer)
+        within(Range(0, size - 1, f"at least 0 and below {size}"), **{name: values})
 
 
 def env_spec(spec: EnvSpec) -> None:

@@ -17,6 +17,7 @@ from typing import Annotated, Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 _FLOAT = np.finfo(np.float32)
 _NUMBERS = (int, float, np.number, np.ndarray, jax.Array)
@@ -110,7 +111,7 @@ def outside(interval: Range, values: Any) -> str | None:
 
 def known(values: Any) -> bool:
     """Whether this process can read the values now: they are not traced, nor on other hosts."""
-    return not isinstance(values, jax.core.Tracer) and getattr(values, "is_fully_addressable", True)
+    return not isinstance(values, Tracer) and getattr(values, "is_fully_addressable", True)
 
 
 @functools.cache

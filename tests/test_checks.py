@@ -269,7 +269,7 @@ def tabular_functions():
         )
 
     visited = {
-        "visitation": jnp.zeros((STATES, ACTIONS)),
+        "visitation": jnp.full((STATES, ACTIONS), 10 / (STATES * ACTIONS)),
         "initial": jnp.full(STATES, 1 / STATES),
         "absorbing": of_states["absorbing"],
     }

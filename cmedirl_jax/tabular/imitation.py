@@ -27,9 +27,10 @@ from cmedirl_jax.envs import Env
 from cmedirl_jax.irl import rewards
 from cmedirl_jax.ranges import AtLeastTwo, BelowOne, NotNegative, Positive, Size
 from cmedirl_jax.tabular import discretise, interpolation, maxent
+from cmedirl_jax.tabular.demonstrations import TabularDemonstrations
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.tabular.interpolation import Grid
-from cmedirl_jax.tabular.maxent import MaxEntResult, TabularDemonstrations
+from cmedirl_jax.tabular.maxent import MaxEntResult
 from cmedirl_jax.types import EnvSpec, Numeric
 
 Kind = Literal["linear", "deep"]
