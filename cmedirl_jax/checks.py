@@ -180,7 +180,7 @@ def env_spec(spec: EnvSpec) -> None:
 
     Raises:
         ValueError: naming the field and what it has to be.
-        TypeError: naming a size that is a float.
+        TypeError: naming a size that is not an integer, or a bound that is not an array of float32.
     """
     sizes(
         **{
@@ -190,10 +190,16 @@ def env_spec(spec: EnvSpec) -> None:
     )
     for of, dim in (("observation", spec.observation_dim), ("action", spec.action_dim)):
         low, high = (getattr(spec, f"{of}_{end}") for end in ("low", "high"))
-        shape(f"{spec.id}: {of}_low", low, (dim,))
-        shape(f"{spec.id}: {of}_high", high, (dim,))
+        for name, bound in ((f"{spec.id}: {of}_low", low), (f"{spec.id}: {of}_high", high)):
+            if not isinstance(bound, np.ndarray):
+                found = type(bound).__name__
+                raise TypeError(f"{name}: expected a numpy array of float32, got a {found}")
+            shape(name, bound, (dim,))
+            # Without jax_enable_x64, JAX reads float64 as float32.
+            if jnp.result_type(bound) != jnp.float32:
+                raise TypeError(f"{name}: expected float32, got {bound.dtype}")
         # Observations may be unbounded; actions are squashed onto their bounds.
-        if of == "action" and not np.isfinite([low, high]).all():
+        if of == "action" and not (np.abs([low, high]) <= ranges.FINITE.high).all():
             raise ValueError(f"{spec.id}: action bounds must be finite, got {low} and {high}")
         if not np.all(np.less(low, high)):
             raise ValueError(f"{spec.id}: {of}_low must be below {of}_high, got {low} and {high}")

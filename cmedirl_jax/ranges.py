@@ -41,16 +41,16 @@ class Range(NamedTuple):
 
 # The library counts in int32 and computes in float32.
 _LARGEST = 2**31 - 1
-_COUNT = Range(0, _LARGEST, "at least 0", "at most 2^31 - 1")
+COUNT = Range(0, _LARGEST, "at least 0", "at most 2^31 - 1")
 FINITE = Range(float(_FLOAT.min), float(_FLOAT.max), "finite")
 NOT_NEGATIVE = FINITE._replace(low=0.0, words="at least 0 and finite")
 POSITIVE = FINITE._replace(low=float(_FLOAT.tiny), words="positive and finite")
 SHARE = Range(0.0, 1.0, "between 0 and 1")
 BELOW_ONE = Range(0.0, 1.0 - float(_FLOAT.epsneg), "at least 0 and below 1")
 
-Count = Annotated[int, _COUNT]
-Size = Annotated[int, _COUNT._replace(low=1, words="at least 1")]
-AtLeastTwo = Annotated[int, _COUNT._replace(low=2, words="at least 2")]
+Count = Annotated[int, COUNT]
+Size = Annotated[int, COUNT._replace(low=1, words="at least 1")]
+AtLeastTwo = Annotated[int, COUNT._replace(low=2, words="at least 2")]
 NotNegative = Annotated[float, NOT_NEGATIVE]
 Positive = Annotated[float, POSITIVE]
 AtLeastOne = Annotated[float, FINITE._replace(low=1.0, words="at least 1 and finite")]

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, ranges
 from cmedirl_jax.irl import base, regularisers, rewards
 from cmedirl_jax.irl.base import RewardLearner, RewardState
 from cmedirl_jax.irl.learner import IRLHParams
@@ -33,7 +33,12 @@ class RandomParams(NamedTuple):
 
 
 def constant(value: float) -> RewardLearner:
-    """Make r_D = `value` everywhere."""
+    """Make r_D = `value` everywhere.
+
+    Raises:
+        ValueError: if the value is not finite.
+    """
+    checks.within(ranges.FINITE, value=value)
     return RewardLearner(
         init=lambda key: RewardState(jnp.asarray(value, jnp.float32), (), ()),
         reward=lambda state, observation, action: jnp.broadcast_to(
@@ -56,13 +61,17 @@ def random(
         network: default `rewards.mlp(spec)`. Its first parameters have to make it vary.
 
     Raises:
-        ValueError: if a bound is infinite.
+        ValueError: if the specification contradicts itself, a bound is infinite, or the bound of
+            the reward is out of range.
     """
+    checks.env_spec(spec)
+    hparams = hparams or IRLHParams()
+    ranges.check(hparams)
     if not all(np.isfinite(bound).all() for bound in _bounds(spec)):
         raise ValueError(f"{spec.id}: uniform pairs need finite bounds, got {_bounds(spec)}")
     network = network or rewards.mlp(spec)
     return RewardLearner(
-        init=functools.partial(_init_random, spec, network, hparams or IRLHParams()),
+        init=functools.partial(_init_random, spec, network, hparams),
         reward=functools.partial(_random_reward, spec, network),
         update=base.learn_nothing,
     )
