@@ -67,8 +67,9 @@ def random(
     checks.env_spec(spec)
     hparams = hparams or IRLHParams()
     ranges.check(hparams)
-    if not all(np.isfinite(bound).all() for bound in _bounds(spec)):
-        raise ValueError(f"{spec.id}: uniform pairs need finite bounds, got {_bounds(spec)}")
+    bounds = spec.observation_low, spec.observation_high
+    if not np.isfinite(bounds).all():
+        raise ValueError(f"{spec.id}: uniform pairs need finite bounds, got {bounds}")
     network = network or rewards.mlp(spec)
     return RewardLearner(
         init=functools.partial(_init_random, spec, network, hparams),
@@ -82,11 +83,10 @@ def _init_random(
 ) -> RewardState:
     network_key, observation_key, action_key = jax.random.split(key, 3)
     params = network.init(network_key)
-    observation_low, observation_high, action_low, action_high = _bounds(spec)
     output = network.apply(
         params,
-        _uniform(observation_key, observation_low, observation_high),
-        _uniform(action_key, action_low, action_high),
+        _uniform(observation_key, spec.observation_low, spec.observation_high),
+        _uniform(action_key, spec.action_low, spec.action_high),
     )
     standardised = RandomParams(params, jnp.mean(output), jnp.std(output))
     return RewardState(standardised, (), traced(hparams))
@@ -103,10 +103,6 @@ def _random_reward(
     params, mean, deviation = state.params
     output = (network.apply(params, observation, action) - mean) / deviation
     return regularisers.bounded(output, state.hparams.bound)
-
-
-def _bounds(spec: EnvSpec) -> tuple[np.ndarray, ...]:
-    return spec.observation_low, spec.observation_high, spec.action_low, spec.action_high
 
 
 def _uniform(key: jax.Array, low: np.ndarray, high: np.ndarray) -> jax.Array:

@@ -186,7 +186,7 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
     the `d` inputs scaled to [0, 1]: the observation, and then the action.
 
     Raises:
-        ValueError: if the order is less than one, or an input has an infinite bound.
+        ValueError: if the order is less than one, or the observation has an infinite bound.
     """
     checks.env_spec(spec)
     if order < 1:

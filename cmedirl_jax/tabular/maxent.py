@@ -164,6 +164,7 @@ def deep_maxent_irl(
     """
     checks.sizes(steps=steps)
     checks.within(ranges.NOT_NEGATIVE, prior_precision=prior_precision)
+    checks.within(ranges.FINITE, **{f"inputs[{i}]": array for i, array in enumerate(inputs)})
     initial, size = demonstrations.initial, jnp.shape(demonstrations.visitation)
     dynamics_lib.check(dynamics, size, initial=initial, absorbing=absorbing)
     dynamics_lib.check_control(discount, horizon, temperature)
