@@ -1,16 +1,19 @@
 """Checks of arguments by name, and when numbers count as in bounds or equal.
 
-They run while tracing or on the host, and cost nothing in a compiled program.
+The checks run while tracing or on the host, and cost nothing in a compiled program. Shapes and
+dtypes are always checked; values where they are known on the host, so those of traced arrays pass.
 """
 
-import math
+import operator
 from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.types import EnvSpec, Numeric, Transition
+from cmedirl_jax import ranges
+from cmedirl_jax.ranges import Range
+from cmedirl_jax.types import Array, EnvSpec, Numeric, Transition
 
 ROUNDINGS = 100.0
 """Roundings by which two numbers may differ and still count as equal. Steps of Gymnasium's own
@@ -125,7 +128,7 @@ def tolerance(values: np.ndarray) -> np.ndarray:
     return ROUNDINGS * float(np.finfo(np.float32).eps) * (size + size.mean(axis=0) + 0.01)
 
 
-def sizes(**named: int) -> None:
+def sizes(**named: Numeric) -> None:
     """Check that static sizes are positive integers.
 
     Raises:
@@ -135,7 +138,7 @@ def sizes(**named: int) -> None:
     _at_least(1, named)
 
 
-def counts(**named: int) -> None:
+def counts(**named: Numeric) -> None:
     """Check that static counts are integers and not negative.
 
     Raises:
@@ -145,39 +148,57 @@ def counts(**named: int) -> None:
     _at_least(0, named)
 
 
-def _at_least(low: int, named: Mapping[str, int]) -> None:
+def _at_least(low: int, named: Mapping[str, Any]) -> None:
     for name, size in named.items():
-        if isinstance(size, float | np.floating):
-            raise TypeError(f"{name}: expected an integer, got {size}")
-        if _known(size) and size < low:
+        if not ranges.known(size):
+            continue
+        try:
+            number = operator.index(size)
+        except TypeError:
+            raise TypeError(f"{name}: expected an integer, got {size}") from None
+        if number < low:
             raise ValueError(f"{name} must be at least {low}, got {size}")
 
 
-def shares(**named: Numeric) -> None:
-    """Check that numbers are between 0 and 1. Arrays pass, as their values may be unknown.
+def shares(**named: Numeric | Array) -> None:
+    """Check that numbers are between 0 and 1.
 
     Raises:
         ValueError: naming the first that is not.
     """
-    for name, share in named.items():
-        if _known(share) and not 0.0 <= share <= 1.0:
-            raise ValueError(f"{name} must be between 0 and 1, got {share}")
+    within(ranges.SHARE, **named)
 
 
-def positive(**named: Numeric) -> None:
-    """Check that numbers are positive and finite. Arrays pass, as their values may be unknown.
+def positive(**named: Numeric | Array) -> None:
+    """Check that numbers are positive and finite.
 
     Raises:
         ValueError: naming the first that is not.
     """
-    for name, number in named.items():
-        if _known(number) and not 0.0 < number < math.inf:
-            raise ValueError(f"{name} must be positive and finite, got {number}")
+    within(ranges.POSITIVE, **named)
 
 
-def _known(number: Any) -> bool:
-    """Whether it is a number on the host, not an array that may be traced."""
-    return isinstance(number, int | float | np.number)
+def within(interval: Range, **named: Numeric | Array) -> None:
+    """Check that numbers, or all entries of arrays, lie in an interval.
+
+    Raises:
+        ValueError: naming the first that does not, what it must be, what it is and where.
+    """
+    for name, values in named.items():
+        if wrong := ranges.outside(interval, values):
+            raise ValueError(f"{name} {wrong}")
+
+
+def indices(size: int, **named: Array) -> None:
+    """Check that integers index an axis of length `size`, from its beginning.
+
+    Raises:
+        ValueError: naming the first that is negative or not below `size`.
+        TypeError: if they are not integers.
+    """
+    for name, values in named.items():
+        kind(name, values, jnp.integer)
+        within(Range(0, size - 1, f"at least 0 and below {size}"), **{name: values})
 
 
 def env_spec(spec: EnvSpec) -> None:
@@ -185,7 +206,7 @@ def env_spec(spec: EnvSpec) -> None:
 
     Raises:
         ValueError: naming the field and what it has to be.
-        TypeError: naming a size that is a float.
+        TypeError: naming a size that is not an integer, or a bound that is not an array of float32.
     """
     sizes(
         **{
@@ -195,10 +216,16 @@ def env_spec(spec: EnvSpec) -> None:
     )
     for of, dim in (("observation", spec.observation_dim), ("action", spec.action_dim)):
         low, high = (getattr(spec, f"{of}_{end}") for end in ("low", "high"))
-        shape(f"{spec.id}: {of}_low", low, (dim,))
-        shape(f"{spec.id}: {of}_high", high, (dim,))
+        for name, bound in ((f"{spec.id}: {of}_low", low), (f"{spec.id}: {of}_high", high)):
+            if not isinstance(bound, np.ndarray):
+                found = type(bound).__name__
+                raise TypeError(f"{name}: expected a numpy array of float32, got a {found}")
+            shape(name, bound, (dim,))
+            # Without jax_enable_x64, JAX reads float64 as float32.
+            if jnp.result_type(bound) != jnp.float32:
+                raise TypeError(f"{name}: expected float32, got {bound.dtype}")
         # Observations may be unbounded; actions are squashed onto their bounds.
-        if of == "action" and not np.isfinite([low, high]).all():
+        if of == "action" and not (np.abs([low, high]) <= ranges.FINITE.high).all():
             raise ValueError(f"{spec.id}: action bounds must be finite, got {low} and {high}")
         if not np.all(np.less(low, high)):
             raise ValueError(f"{spec.id}: {of}_low must be below {of}_high, got {low} and {high}")

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, ranges
 from cmedirl_jax.ranges import Count, NotNegative, Size
 from cmedirl_jax.types import EnvSpec, Network, Params
 
@@ -144,8 +144,14 @@ def critic(spec: EnvSpec, architecture: Architecture) -> Network:
 
 
 def make(spec: EnvSpec, architecture: Architecture | None = None) -> ActorCritic:
-    """The actor, the critic and the squashing onto `spec`'s action bounds."""
+    """The actor, the critic and the squashing onto `spec`'s action bounds.
+
+    Raises:
+        ValueError: if the specification contradicts itself, or a number of the architecture is out
+            of range.
+    """
     architecture = architecture or Architecture()
+    ranges.check(architecture)
     return ActorCritic(actor(spec, architecture), critic(spec, architecture), squashing(spec), spec)
 
 
@@ -179,7 +185,12 @@ def imitation_error(
 
 
 def squashing(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
-    """Tanh onto the action bounds: `[..., A]` -> `[..., A]`."""
+    """Tanh onto the action bounds: `[..., A]` -> `[..., A]`.
+
+    Raises:
+        ValueError: if the specification contradicts itself.
+    """
+    checks.env_spec(spec)
     centre = jnp.asarray(0.5 * (spec.action_high + spec.action_low))
     half_width = jnp.asarray(0.5 * (spec.action_high - spec.action_low))
     return lambda pre_activation: centre + half_width * jnp.tanh(pre_activation)
@@ -191,8 +202,9 @@ def observation_scaling(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
     The map raises ValueError for another last axis, and TypeError for arrays that are not floats.
 
     Raises:
-        ValueError: if a bound is infinite.
+        ValueError: if the specification contradicts itself, or a bound is infinite.
     """
+    checks.env_spec(spec)
     if not (np.isfinite(spec.observation_low).all() and np.isfinite(spec.observation_high).all()):
         raise ValueError(
             f"{spec.id}: observations can only be normalised by finite bounds, "

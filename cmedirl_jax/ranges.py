@@ -6,7 +6,7 @@ A settings class annotates a field with one of the types below, or with `Annotat
         batch_size: Size = 32
         seed: Annotated[int, Range(0, 2**32 - 1, "between 0 and 2^32 - 1")] = 0
 
-`check` reads these annotations.
+`check` reads these annotations. Numbers and arrays on the host are checked; traced ones pass.
 """
 
 import dataclasses
@@ -15,9 +15,12 @@ import typing
 from collections.abc import Iterator
 from typing import Annotated, Any, NamedTuple
 
+import jax
 import numpy as np
+from jax.core import Tracer
 
 _FLOAT = np.finfo(np.float32)
+_NUMBERS = (int, float, np.number, np.ndarray, jax.Array)
 
 
 class Range(NamedTuple):
@@ -38,22 +41,26 @@ class Range(NamedTuple):
 
 # The library counts in int32 and computes in float32.
 _LARGEST = 2**31 - 1
-_COUNT = Range(0, _LARGEST, "at least 0", "at most 2^31 - 1")
-POSITIVE = Range(float(_FLOAT.tiny), float(_FLOAT.max), "positive and finite")
+COUNT = Range(0, _LARGEST, "at least 0", "at most 2^31 - 1")
+FINITE = Range(float(_FLOAT.min), float(_FLOAT.max), "finite")
+NOT_NEGATIVE = FINITE._replace(low=0.0, words="at least 0 and finite")
+POSITIVE = FINITE._replace(low=float(_FLOAT.tiny), words="positive and finite")
+SHARE = Range(0.0, 1.0, "between 0 and 1")
+BELOW_ONE = Range(0.0, 1.0 - float(_FLOAT.epsneg), "at least 0 and below 1")
 
-Count = Annotated[int, _COUNT]
-Size = Annotated[int, _COUNT._replace(low=1, words="at least 1")]
-AtLeastTwo = Annotated[int, _COUNT._replace(low=2, words="at least 2")]
-NotNegative = Annotated[float, Range(0.0, float(_FLOAT.max), "at least 0 and finite")]
+Count = Annotated[int, COUNT]
+Size = Annotated[int, COUNT._replace(low=1, words="at least 1")]
+AtLeastTwo = Annotated[int, COUNT._replace(low=2, words="at least 2")]
+NotNegative = Annotated[float, NOT_NEGATIVE]
 Positive = Annotated[float, POSITIVE]
-AtLeastOne = Annotated[float, Range(1.0, float(_FLOAT.max), "at least 1 and finite")]
-Share = Annotated[float, Range(0.0, 1.0, "between 0 and 1")]
-PositiveShare = Annotated[float, Range(float(_FLOAT.tiny), 1.0, "above 0 and at most 1")]
-BelowOne = Annotated[float, Range(0.0, 1.0 - float(_FLOAT.epsneg), "at least 0 and below 1")]
+AtLeastOne = Annotated[float, FINITE._replace(low=1.0, words="at least 1 and finite")]
+Share = Annotated[float, SHARE]
+PositiveShare = Annotated[float, SHARE._replace(low=POSITIVE.low, words="above 0 and at most 1")]
+BelowOne = Annotated[float, BELOW_ONE]
 
 
 def check(settings: Any) -> None:
-    """Refuse numbers out of their range. Arrays pass, as their values may be unknown.
+    """Refuse numbers out of their range.
 
     Args:
         settings: a dataclass; its numbers and nested dataclasses are checked.
@@ -79,18 +86,32 @@ def out_of_range(settings: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
             continue
         # In a tuple, each number is checked.
         for number in value if isinstance(value, tuple) else (value,):
-            if not isinstance(number, int | float | np.number) or isinstance(number, bool):
+            if isinstance(number, bool) or not isinstance(number, _NUMBERS):
                 continue
             if interval is None:
                 raise TypeError(f"{name} has no range: annotate its field with one")
-            if not interval.low <= number <= interval.high:
-                yield name, f"must be {_words(interval, number)}, got {number}"
+            if wrong := outside(interval, number):
+                yield name, wrong
 
 
-def _words(interval: Range, number: Any) -> str:
-    if interval.too_large is not None and number > interval.high:
-        return interval.too_large
-    return interval.words
+def outside(interval: Range, values: Any) -> str | None:
+    """What is wrong with the first number of `values` outside an interval; None if none is."""
+    if not known(values):
+        return None
+    array = np.asarray(values)
+    places = np.argwhere(~((interval.low <= array) & (array <= interval.high)))
+    if not len(places):
+        return None
+    place = tuple(places[0].tolist())
+    number = array[place]
+    too_large = interval.too_large is not None and number > interval.high
+    words = interval.too_large if too_large else interval.words
+    return f"must be {words}, got {number}" + (f" at {list(place)}" if place else "")
+
+
+def known(values: Any) -> bool:
+    """Whether this process can read the values now: they are not traced, nor on other hosts."""
+    return not isinstance(values, Tracer) and getattr(values, "is_fully_addressable", True)
 
 
 @functools.cache

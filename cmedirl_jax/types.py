@@ -19,6 +19,9 @@ Numeric = jax.Array | float
 class EnvSpec(NamedTuple):
     """What an algorithm needs to know about an environment.
 
+    `checks.env_spec` holds it to what is said here, wherever a specification is taken. Bounds are
+    numpy arrays, not lists; float64 is read as float32 unless `jax_enable_x64` is set.
+
     Attributes:
         id: the environment's name, as Gymnasium writes it.
         observation_dim: `O`, the length of an observation vector.

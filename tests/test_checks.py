@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmedirl_jax import checks, irl, tabular
+from cmedirl_jax import checks, envs, irl, networks, ranges, tabular
 from cmedirl_jax.agents import ddpg, exploration, hot_start
 from cmedirl_jax.agents.exploration import EpsilonGreedyHParams
 from cmedirl_jax.data import demonstrations, episodes, replay
@@ -13,6 +13,7 @@ from cmedirl_jax.training import compose, schedules
 from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.types import RewardBatch, Transition
+from tests.support import pools
 
 
 def transition(spec, *leading):
@@ -55,8 +56,9 @@ def test_any_leaf_of_another_dtype_is_refused_by_name(skewed_spec, field):
         ({"action_dim": -1}, "action_dim must be at least 1, got -1"),
         ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, got 0"),
         ({"observation_dim": 2}, r"observation_low: expected shape \(2,\), got \(3,\)"),
-        ({"action_high": np.float32(1.0)}, r"action_high: expected shape \(2,\), got \(\)"),
+        ({"action_high": np.array(1.0)}, r"action_high: expected shape \(2,\), got \(\)"),
         ({"action_low": np.array([-np.inf, 0.5])}, "action bounds must be finite"),
+        ({"action_high": np.array([3.0, 1e39])}, "action bounds must be finite"),
         ({"action_high": np.array([3.0, np.nan])}, "action bounds must be finite"),
         ({"action_low": np.array([-1.0, 1.0])}, "action_low must be below action_high"),
         ({"observation_low": np.array([-1.0, 0.0, 11.0])}, "observation_low must be below"),
@@ -71,6 +73,74 @@ def test_a_specification_that_contradicts_itself_is_refused(skewed_spec, change,
             refuse(wrong)
     with pytest.raises(ValueError, match=named):
         compose.compose(wrong, METHODS["ddpg"], Settings(), capacity=10)
+
+
+def takers_of_a_spec():
+    """Every public function that reads a specification, by name."""
+    env = envs.make("MountainCarContinuous-v0")
+    pool = pools.random_pool([3])
+    return {
+        "envs.check": lambda spec: envs.check(env._replace(spec=spec)),
+        "compose": lambda spec: compose.compose(spec, METHODS["ddpg"], Settings(), capacity=10),
+        "ddpg.make": ddpg.make,
+        "irl.make": irl.make,
+        "gail.make": irl.gail.make,
+        "random": irl.controls.random,
+        "replay.make": lambda spec: replay.make(spec, 10),
+        "networks.make": networks.make,
+        "exploration.make": exploration.make,
+        "rewards.make": rewards.make,
+        "radial_basis": lambda spec: rewards.radial_basis(spec, 2),
+        "fourier": lambda spec: rewards.fourier(spec, 1),
+        "grids": lambda spec: tabular.discretise.grids(spec, (2, 2), (2,)),
+        "validate": lambda spec: demonstrations.validate(pool, spec),
+    }
+
+
+@pytest.mark.parametrize(
+    ("bound", "named"),
+    [
+        ([-1.0], "a numpy array of float32, got a list"),
+        ((-1,), "a numpy array of float32, got a tuple"),
+        (jnp.array([-1.0]), "a numpy array of float32, got a ArrayImpl"),
+        (np.array([-1]), "float32, got int64"),
+        (np.array([-1.0], np.float16), "float32, got float16"),
+    ],
+)
+def test_all_that_take_a_specification_refuse_the_same_bounds(spec, bound, named):
+    for refuse in takers_of_a_spec().values():
+        with pytest.raises(TypeError, match=rf"^{spec.id}: action_low: expected {named}$"):
+            refuse(spec._replace(action_low=bound))
+
+
+def test_bounds_in_float64_are_float32_to_all_or_with_x64_refused_by_all(spec):
+    wide = spec._replace(action_low=np.array([-1.0]), observation_high=np.array([0.6, 0.07]))
+    for accept in takers_of_a_spec().values():
+        accept(wide)
+    seen = networks.make(wide).squash(jnp.float32([0.3]))
+    np.testing.assert_array_equal(seen, networks.make(spec).squash(jnp.float32([0.3])))
+    with jax.enable_x64(True):
+        for refuse in takers_of_a_spec().values():
+            with pytest.raises(TypeError, match="expected float32, got float64"):
+                refuse(wide)
+
+
+@pytest.mark.parametrize("discount", [2.0, float("nan"), -0.5, np.array(2.0), jnp.array(2.0)])
+def test_hyperparameters_out_of_range_are_refused_by_all_that_take_them(spec, discount):
+    with pytest.raises(ValueError, match=f"discount must be between 0 and 1, got {discount}"):
+        ddpg.make(spec, ddpg.DDPGHParams(discount=discount))
+    zero = jnp.zeros(3)
+    with pytest.raises(ValueError, match=f"discount must be between 0 and 1, got {discount}"):
+        shaping.potential(zero, zero, zero, zero > 0, discount)
+    for make in (irl.make, irl.controls.random):
+        with pytest.raises(ValueError, match=r"bound must be .*, got -0.5"):
+            make(spec, irl.IRLHParams(bound=-0.5))
+    with pytest.raises(ValueError, match=r"learning_rate must be .*, got nan"):
+        irl.gail.make(spec, irl.gail.GAILHParams(learning_rate=float("nan")))
+    with pytest.raises(ValueError, match=r"epsilon_start must be between 0 and 1, got 2\.0"):
+        exploration.epsilon_greedy(spec, EpsilonGreedyHParams(epsilon_start=2.0))
+    with pytest.raises(ValueError, match="weight must be finite, got inf"):
+        shaping.additive(zero, zero, float("inf"))
 
 
 def test_observations_may_be_unbounded(skewed_spec):
@@ -269,7 +339,7 @@ def tabular_functions():
         )
 
     visited = {
-        "visitation": jnp.zeros((STATES, ACTIONS)),
+        "visitation": jnp.full((STATES, ACTIONS), 10 / (STATES * ACTIONS)),
         "initial": jnp.full(STATES, 1 / STATES),
         "absorbing": of_states["absorbing"],
     }
@@ -372,10 +442,11 @@ def test_a_horizon_of_zero_is_refused(solve):
 @pytest.mark.parametrize("check", [checks.sizes, checks.counts])
 def test_sizes_are_whole_numbers(check):
     check(size=1, other=np.int64(3))
-    with pytest.raises(TypeError, match=r"size: expected an integer, got 2\.5"):
-        check(size=2.5)
+    for wrong in (2.5, np.float32(2.5), jnp.float32(2.5), "2.5"):
+        with pytest.raises(TypeError, match=r"size: expected an integer, got 2\.5"):
+            check(size=wrong)
     with pytest.raises(ValueError, match=r"size must be at least \d, got -1"):
-        check(size=np.int64(-1))
+        check(size=jnp.int32(-1))
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.1, float("nan"), np.float32(2.0)])
@@ -397,11 +468,18 @@ def test_what_is_left_of_a_difference_may_differ_by_what_was_subtracted():
     assert 0.0 < np.abs(exact - rounded) <= checks.tolerance(exact) < 2e-7
 
 
+def test_every_entry_of_an_array_on_the_host_is_checked():
+    checks.within(ranges.SHARE, grid=np.array([[0.0, 1.0]]))
+    with pytest.raises(ValueError, match=r"^grid must be between 0 and 1, got 2\.0 at \[1, 0\]$"):
+        checks.within(ranges.SHARE, grid=jnp.array([[0.0, 1.0], [2.0, jnp.nan]]))
+
+
 def test_traced_values_pass():
     def check(number):
         checks.sizes(number=number)
         checks.shares(number=number)
         checks.positive(number=number)
+        checks.within(ranges.SHARE, number=number)
         return number
 
     assert jax.jit(check)(-5) == -5

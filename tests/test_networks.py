@@ -222,13 +222,15 @@ def test_observation_scaling_maps_the_bounds_to_one(skewed_spec):
 
 
 def test_infinite_observation_bounds_cannot_be_normalised(skewed_spec):
-    unbounded = skewed_spec._replace(observation_high=np.array([1, np.inf, 1], np.float32))
+    unbounded = skewed_spec._replace(observation_high=np.array([3, np.inf, 10], np.float32))
     with pytest.raises(ValueError, match=r"Skewed-v0.*finite bounds"):
         networks.make(unbounded)
     networks.make(unbounded, Architecture(normalise_observation=False))
 
 
-@pytest.mark.parametrize("action_layer", [-1, 3])
-def test_the_action_must_join_at_a_layer(skewed_spec, action_layer):
-    with pytest.raises(ValueError, match=f"between 0 and 2, .*, got {action_layer}"):
+@pytest.mark.parametrize(
+    ("action_layer", "must"), [(-1, "at least 0, got -1"), (3, "between 0 and 2, .*, got 3")]
+)
+def test_the_action_must_join_at_a_layer(skewed_spec, action_layer, must):
+    with pytest.raises(ValueError, match=f"action_layer must be {must}"):
         networks.make(skewed_spec, Architecture(hidden=(8, 6), action_layer=action_layer))

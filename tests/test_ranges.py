@@ -78,11 +78,14 @@ def test_composition_names_numbers_out_of_range(spec):
         compose.compose(spec, METHODS["ddpg"], with_tau(-1), capacity=10)
 
 
-def test_traced_numbers_and_arrays_pass():
+def test_arrays_on_the_host_are_checked_and_traced_ones_pass():
     def tau(value):
         settings = with_tau(value)
         ranges.check(settings)
         return settings.agent.tau
 
     np.testing.assert_array_equal(jax.jit(jax.vmap(tau))(jnp.array([0.5, -1.0])), [0.5, -1.0])
-    ranges.check(with_tau(jnp.array(-1.0)))
+    ranges.check(with_tau(jnp.array([0.5, 1.0])))
+    for wrong, said in ((jnp.array(-1.0), "-1.0"), (np.array([0.5, np.nan]), r"nan at \[1\]")):
+        with pytest.raises(ValueError, match=f"^agent.tau must be above 0 .*, got {said}$"):
+            ranges.check(with_tau(wrong))

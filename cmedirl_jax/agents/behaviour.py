@@ -112,7 +112,13 @@ def assemble(
     perturb: PerturbFn,
     log_density: LogDensityFn,
 ) -> Exploration:
-    """Make an exploration of its functions, and check the arrays that reach them."""
+    """Make an exploration of its functions, and check the arrays that reach them.
+
+    Raises:
+        ValueError: if the specification contradicts itself.
+        TypeError: if a bound is not an array of float32.
+    """
+    checks.env_spec(spec)
     shapes = jax.tree.map(jnp.shape, jax.eval_shape(lambda: draw(jax.random.key(0))))
     checked_perturb = functools.partial(_perturb, spec, shapes, perturb)
     return Exploration(

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import checks, optimizers
+from cmedirl_jax import checks, optimizers, ranges
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.networks import ActorCritic
 from cmedirl_jax.optimizers import traced
@@ -168,9 +168,11 @@ def make(
         critic_optimizer: the same for the critic.
 
     Raises:
-        ValueError: if the specification contradicts itself.
+        ValueError: if the specification contradicts itself, or a hyperparameter is out of range.
     """
     checks.env_spec(spec)
+    hparams = hparams or DDPGHParams()
+    ranges.check(hparams)
     parts = _Parts(
         spec=spec,
         networks=networks or networks_lib.make(spec),
@@ -179,7 +181,7 @@ def make(
     )
     return DDPG(
         networks=parts.networks,
-        init=functools.partial(_init, parts, hparams or DDPGHParams()),
+        init=functools.partial(_init, parts, hparams),
         act=functools.partial(_act, parts),
         value=functools.partial(_value, parts),
         update=functools.partial(_update, parts),

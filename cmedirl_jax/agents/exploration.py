@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, ranges
 from cmedirl_jax.agents import behaviour, densities
 from cmedirl_jax.agents.behaviour import Exploration, ExplorationKind
 from cmedirl_jax.optimizers import traced
@@ -134,6 +134,7 @@ def check_density(settings: ExplorationSettings, *, trajectories: bool, mixture:
 def gaussian(spec: EnvSpec, hparams: GaussianHParams | None = None) -> Exploration:
     """clip(mu(s) + sigma eps) with eps ~ N(0, I). Its state is its hyperparameters."""
     initial = hparams or GaussianHParams()
+    ranges.check(initial)
     return behaviour.assemble(
         spec,
         init=lambda key: traced(initial),
@@ -193,6 +194,7 @@ def ornstein_uhlenbeck(
     x is smaller at an episode's first steps, and later the state s depends on it.
     """
     initial = hparams or OrnsteinUhlenbeckHParams()
+    ranges.check(initial)
     return behaviour.assemble(
         spec,
         init=lambda key: OrnsteinUhlenbeckState(
@@ -291,6 +293,7 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
     same dependence.
     """
     initial = hparams or EpsilonGreedyHParams()
+    ranges.check(initial)
     return behaviour.assemble(
         spec,
         init=lambda key: HeldActionState(

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cmedirl_jax import checks, grids
+from cmedirl_jax import checks, grids, ranges
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.hot_start_data import HotStartData, prepare
@@ -92,11 +92,12 @@ def fit(
         The fitted `(actor, critic)`.
 
     Raises:
-        ValueError: if the pool does not fit the networks, or a size of `hparams` is not positive.
+        ValueError: if the pool does not fit the networks, a number of `hparams` is out of range, or
+            the subset is not of the pool.
         TypeError: if a leaf of the pool has a wrong dtype.
     """
     hparams = hparams or HotStartHParams()
-    checks.sizes(cells=hparams.cells, steps=hparams.steps, batch_size=hparams.batch_size)
+    ranges.check(hparams)
     if isinstance(demonstrations, Demonstrations):
         demonstrations = prepare(demonstrations)
     pool = jax.tree.map(jnp.asarray, demonstrations)
@@ -104,7 +105,7 @@ def fit(
     size = pool.transition.observation.shape[:1]
     checks.transition_shapes(networks.spec, pool.transition, size, "demonstrations")
     checks.shape("discounted_return", pool.discounted_return, size)
-    checks.shape("subset.length", chosen.length, jnp.shape(chosen.start)[:1])
+    demonstrations_lib.check_subset(chosen, *size)
 
     optimizer = optax.adam(hparams.learning_rate)
     step = functools.partial(_step, networks, hparams, optimizer, pool, chosen)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, ranges
 from cmedirl_jax.data.formats import load, save
 from cmedirl_jax.data.validation import check, validate
 from cmedirl_jax.types import Demonstrations, DemonstrationSubset, Numeric, Transition
@@ -90,10 +90,10 @@ def sample_index(key: jax.Array, subset: DemonstrationSubset, batch_size: int) -
     """Draw steps of the pool, `[batch_size]` int32, uniformly over the subset's episodes' steps.
 
     Raises:
-        ValueError: if the subset's fields are not `[n]`, or `batch_size` is negative.
+        ValueError: as `check_subset`, or if `batch_size` is negative.
         TypeError: if the subset or `batch_size` is not of integers.
     """
-    _check_subset(subset)
+    check_subset(subset)
     checks.counts(batch_size=batch_size)
     subset = jax.tree.map(jnp.asarray, subset)
     ends = jnp.cumsum(subset.length)
@@ -118,10 +118,11 @@ def sample(
         batch_size: how many steps.
 
     Raises:
-        ValueError: if the subset's fields are not `[n]`, or `batch_size` is negative.
+        ValueError: as `check_subset`, or if `batch_size` is negative.
         TypeError: if the subset or `batch_size` is not of integers.
     """
     transition = pool.transition if isinstance(pool, Demonstrations) else pool
+    check_subset(subset, len(transition.reward))
     return at(transition, sample_index(key, subset, batch_size))
 
 
@@ -129,22 +130,43 @@ def sample_episodes(key: jax.Array, subset: DemonstrationSubset, count: int) -> 
     """Draw episodes of the subset, `[count]` int32, uniformly with replacement; never its padding.
 
     Raises:
-        ValueError: if the subset's fields are not `[n]`, or `count` is negative.
+        ValueError: as `check_subset`, or if `count` is negative.
         TypeError: if the subset or `count` is not of integers.
     """
-    _check_subset(subset)
+    check_subset(subset)
     checks.counts(count=count)
     return jax.random.randint(key, (count,), 0, jnp.sum(jnp.asarray(subset.length) > 0), jnp.int32)
 
 
-def _check_subset(subset: DemonstrationSubset) -> None:
+def check_subset(subset: DemonstrationSubset, steps: int | None = None) -> None:
+    """Check a subset, of a pool of so many steps if they are given.
+
+    Raises:
+        ValueError: if its fields are not `[n]`; if known entries are negative, all lengths are 0,
+            or an episode reaches beyond the pool.
+        TypeError: if a field is not of integers.
+    """
     for name, leaf in subset._asdict().items():
         checks.shape(f"subset.{name}", leaf, (jnp.size(subset.start),))
         checks.kind(f"subset.{name}", leaf, jnp.integer)
+        checks.within(ranges.COUNT, **{f"subset.{name}": leaf})
+    if not all(map(ranges.known, subset)):
+        return
+    start, length = map(np.asarray, subset)
+    if not length.any():
+        raise ValueError(f"subset.length: expected a positive one, got {length}")
+    if steps is not None and (end := np.max((start + length)[length > 0])) > steps:
+        raise ValueError(f"subset: an episode ends at step {end}, the pool has {steps} steps")
 
 
 def at(pool: Transition, index: jax.Array) -> Transition:
-    """The steps `index` `[...]` of a pool's transitions, leaves `[..., ...]`."""
+    """The steps `index` `[...]` of a pool's transitions, leaves `[..., ...]`.
+
+    Raises:
+        ValueError: if a known index is negative or beyond the pool.
+        TypeError: if the indices are not integers.
+    """
+    checks.indices(len(pool.reward), index=index)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], pool)
 
 

@@ -62,9 +62,9 @@ def make(capacity: int, replay_capacity: int, max_length: int) -> Episodes:
 
     Raises:
         ValueError: if one of them is not positive.
+        TypeError: if one is not an integer.
     """
-    if min(capacity, replay_capacity, max_length) < 1:
-        raise ValueError("capacity, replay_capacity and max_length must be positive")
+    checks.sizes(capacity=capacity, replay_capacity=replay_capacity, max_length=max_length)
     return Episodes(
         init=functools.partial(_init, capacity),
         step=functools.partial(_step, capacity),

@@ -22,12 +22,17 @@ def save(path: str | Path, demonstrations: Demonstrations) -> None:
     """Write a pool as a compressed npz file. If that fails, an older file at `path` is kept.
 
     Raises:
-        ValueError: if the pool is not valid.
+        ValueError: if the pool is not valid, or its metadata do not name the environment: `load`
+            compares that with its `spec`.
         OSError: if the file cannot be written.
     """
     validate(demonstrations)
+    metadata = demonstrations.metadata
+    env = metadata.get("env") if isinstance(metadata, dict) else None
+    if not isinstance(env, str):
+        raise ValueError(f"metadata['env']: expected the environment's name, got {env!r}")
     path = Path(path)
-    header = {"format": FORMAT, "version": FORMAT_VERSION, "metadata": demonstrations.metadata}
+    header = {"format": FORMAT, "version": FORMAT_VERSION, "metadata": metadata}
     with atomic.replacing(path) as partial, partial.open("wb") as file:
         np.savez_compressed(
             file,

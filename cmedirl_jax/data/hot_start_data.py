@@ -38,8 +38,10 @@ def prepare(
         reward_scale: factor on every reward.
 
     Raises:
-        ValueError: if the discount is not between 0 and 1, or the scale not positive and finite.
+        ValueError: if the pool is not valid, the discount is not between 0 and 1, or the scale not
+            positive and finite.
     """
+    demonstrations_lib.validate(demonstrations)
     checks.positive(reward_scale=reward_scale)
     returns = demonstrations_lib.discounted_returns(demonstrations, discount)
     return HotStartData(

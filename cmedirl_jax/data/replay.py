@@ -51,7 +51,8 @@ class Replay(NamedTuple):
             TypeError if the bits are not unsigned integers.
         rows: `(state, bits, recent=None) -> index`, the rows of the storage that `take` reads.
         at: `(state, index [...]) -> Transition`, the transitions in these rows, leaves
-            `[..., ...]`.
+            `[..., ...]`. Raises ValueError if a known index is not one of a row, TypeError if the
+            indices are not integers.
     """
 
     init: Callable[[], ReplayState]
@@ -68,9 +69,10 @@ def make(spec: EnvSpec, capacity: int) -> Replay:
 
     Raises:
         ValueError: if `capacity` is not positive.
+        TypeError: if it is not an integer.
     """
-    if capacity < 1:
-        raise ValueError(f"replay capacity must be positive, got {capacity}")
+    checks.env_spec(spec)
+    checks.sizes(**{"replay capacity": capacity})
     rows = functools.partial(_rows, capacity)
     at = functools.partial(_at, spec)
     take = functools.partial(_take, at, rows)
@@ -134,6 +136,7 @@ def _rows(
 
 
 def _at(spec: EnvSpec, state: ReplayState, index: jax.Array) -> Transition:
+    checks.indices(len(state.storage), index=index)
     return unpack(spec, state.storage[index])
 
 

@@ -10,6 +10,12 @@ from cmedirl_jax import checks
 from cmedirl_jax.envs import Env
 from cmedirl_jax.types import Demonstrations, EnvSpec, Transition
 
+_KINDS = {
+    "terminated": ("b", "bool"),
+    "truncated": ("b", "bool"),
+    "episode": ("i", "signed integers"),
+}
+
 
 def validate(demonstrations: Demonstrations, spec: EnvSpec | None = None) -> None:
     """Check a pool, against a task's specification if `spec` is given.
@@ -21,6 +27,8 @@ def validate(demonstrations: Demonstrations, spec: EnvSpec | None = None) -> Non
             observation in the same episode.
     """
     transition, truncated, episode, metadata = demonstrations
+    if spec is not None:
+        checks.env_spec(spec)
     if spec is not None and metadata.get("env") != spec.id:
         raise ValueError(f"made for environment {metadata.get('env')!r}, not {spec.id!r}")
     arrays = {**transition._asdict(), "truncated": truncated, "episode": episode}
@@ -41,9 +49,9 @@ def _validate_arrays(arrays: dict[str, np.ndarray]) -> None:
         vector = name in ("observation", "next_observation", "action")
         if array.shape[:1] != size or array.ndim != (2 if vector else 1):
             raise ValueError(f"{name} has shape {array.shape}, reward has {size}")
-        kinds = {"terminated": "b", "truncated": "b", "episode": "i"}
-        if array.dtype.kind != kinds.get(name, "f"):
-            raise ValueError(f"{name} has dtype {array.dtype}")
+        kind, words = _KINDS.get(name, ("f", "floats"))
+        if array.dtype.kind != kind:
+            raise ValueError(f"{name} has dtype {array.dtype}, expected {words}")
         if not (np.abs(array) <= np.finfo(np.float32).max).all():
             raise ValueError(f"{name} holds values that are not finite")
     if arrays["observation"].shape != arrays["next_observation"].shape:

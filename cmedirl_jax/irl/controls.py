@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, ranges
 from cmedirl_jax.irl import base, regularisers, rewards
 from cmedirl_jax.irl.base import RewardLearner, RewardState
 from cmedirl_jax.irl.learner import IRLHParams
@@ -33,7 +33,12 @@ class RandomParams(NamedTuple):
 
 
 def constant(value: float) -> RewardLearner:
-    """Make r_D = `value` everywhere."""
+    """Make r_D = `value` everywhere.
+
+    Raises:
+        ValueError: if the value is not finite.
+    """
+    checks.within(ranges.FINITE, value=value)
     return RewardLearner(
         init=lambda key: RewardState(jnp.asarray(value, jnp.float32), (), ()),
         reward=lambda state, observation, action: jnp.broadcast_to(
@@ -56,13 +61,18 @@ def random(
         network: default `rewards.mlp(spec)`. Its first parameters have to make it vary.
 
     Raises:
-        ValueError: if a bound is infinite.
+        ValueError: if the specification contradicts itself, a bound is infinite, or the bound of
+            the reward is out of range.
     """
-    if not all(np.isfinite(bound).all() for bound in _bounds(spec)):
-        raise ValueError(f"{spec.id}: uniform pairs need finite bounds, got {_bounds(spec)}")
+    checks.env_spec(spec)
+    hparams = hparams or IRLHParams()
+    ranges.check(hparams)
+    bounds = spec.observation_low, spec.observation_high
+    if not np.isfinite(bounds).all():
+        raise ValueError(f"{spec.id}: uniform pairs need finite bounds, got {bounds}")
     network = network or rewards.mlp(spec)
     return RewardLearner(
-        init=functools.partial(_init_random, spec, network, hparams or IRLHParams()),
+        init=functools.partial(_init_random, spec, network, hparams),
         reward=functools.partial(_random_reward, spec, network),
         update=base.learn_nothing,
     )
@@ -73,11 +83,10 @@ def _init_random(
 ) -> RewardState:
     network_key, observation_key, action_key = jax.random.split(key, 3)
     params = network.init(network_key)
-    observation_low, observation_high, action_low, action_high = _bounds(spec)
     output = network.apply(
         params,
-        _uniform(observation_key, observation_low, observation_high),
-        _uniform(action_key, action_low, action_high),
+        _uniform(observation_key, spec.observation_low, spec.observation_high),
+        _uniform(action_key, spec.action_low, spec.action_high),
     )
     standardised = RandomParams(params, jnp.mean(output), jnp.std(output))
     return RewardState(standardised, (), traced(hparams))
@@ -94,10 +103,6 @@ def _random_reward(
     params, mean, deviation = state.params
     output = (network.apply(params, observation, action) - mean) / deviation
     return regularisers.bounded(output, state.hparams.bound)
-
-
-def _bounds(spec: EnvSpec) -> tuple[np.ndarray, ...]:
-    return spec.observation_low, spec.observation_high, spec.action_low, spec.action_high
 
 
 def _uniform(key: jax.Array, low: np.ndarray, high: np.ndarray) -> jax.Array:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import checks, optimizers
+from cmedirl_jax import checks, optimizers, ranges
 from cmedirl_jax.irl import base, regularisers, rewards
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.optimizers import traced
@@ -56,16 +56,18 @@ def make(
         optimizer: default Adam at `state.hparams.learning_rate`.
 
     Raises:
-        ValueError: if the specification contradicts itself.
+        ValueError: if the specification contradicts itself, or a hyperparameter is out of range.
     """
     checks.env_spec(spec)
+    hparams = hparams or GAILHParams()
+    ranges.check(hparams)
     parts = _Parts(
         spec=spec,
         network=network or rewards.mlp(spec),
         optimizer=optax.with_extra_args_support(optimizer or optimizers.adam()),
     )
     return RewardLearner(
-        init=functools.partial(_init, parts, hparams or GAILHParams()),
+        init=functools.partial(_init, parts, hparams),
         reward=functools.partial(_reward, parts),
         update=functools.partial(_update, parts),
     )

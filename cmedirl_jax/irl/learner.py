@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cmedirl_jax import checks, optimizers
+from cmedirl_jax import checks, optimizers, ranges
 from cmedirl_jax.irl import base, objectives, regularisers, rewards
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.irl.objectives import OBJECTIVES, Likelihood, ObjectiveName
@@ -111,10 +111,12 @@ def make(
             *negative* posterior, to descend.
 
     Raises:
-        ValueError: if the specification contradicts itself, or there is no such objective.
+        ValueError: if the specification contradicts itself, a hyperparameter is out of range, or
+            there is no such objective.
     """
     checks.env_spec(spec)
     hparams = hparams or IRLHParams()
+    ranges.check(hparams)
     trajectories = OBJECTIVES[hparams.objective].trajectories
     parts = _Parts(
         spec=spec,

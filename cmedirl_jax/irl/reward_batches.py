@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import flax.struct
 import jax
 
+from cmedirl_jax import ranges
 from cmedirl_jax.agents.exploration import Exploration
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.data.replay import Replay, ReplayState
@@ -125,8 +126,9 @@ def make(
         append: whether the demonstrations join the samples, and so the mixture they are drawn from.
 
     Raises:
-        ValueError: if the settings' `snapshots`, `snapshot_period` or `episodes` are not positive.
+        ValueError: if a number of the settings is out of range.
     """
+    ranges.check(settings)
     source = _source(spec, replay, capacity, settings, objective)
     match settings.weights:
         case "uniform":

@@ -96,11 +96,15 @@ def mlp(
     Raises:
         ValueError: if the observation has an infinite bound.
     """
+    checks.env_spec(spec)
     architecture = networks.Architecture(hidden=hidden, critic_normalisation="none")
     if inputs == "state-action":
         network = networks.critic(spec, architecture)
         return network._replace(apply=functools.partial(_apply_to_pairs, spec, network))
-    network = networks.scalar_output(networks.actor(spec._replace(action_dim=1), architecture))
+    one = spec._replace(
+        action_dim=1, action_low=spec.action_low[:1], action_high=spec.action_high[:1]
+    )
+    network = networks.scalar_output(networks.actor(one, architecture))
     return network._replace(apply=functools.partial(_apply_to_states, spec, network))
 
 
@@ -125,6 +129,7 @@ def linear(spec: EnvSpec, features: Features) -> Network:
     It starts from theta = 0 and ignores the key: there is no symmetry to break, and a reward of
     zero has no preference. Without a bound the likelihood is concave in theta.
     """
+    checks.env_spec(spec)
     size = jax.eval_shape(features, spec.observation_low, spec.action_low).shape[-1]
     return Network(
         init=lambda key: jnp.zeros(size, jnp.float32),
@@ -143,6 +148,7 @@ def radial_basis(spec: EnvSpec, centres: int, inputs: Inputs = "state-action") -
     Raises:
         ValueError: if there are fewer than two centres, or the observation has an infinite bound.
     """
+    checks.env_spec(spec)
     if centres < 2:
         raise ValueError(f"radial basis functions need two centres or more, got {centres}")
     scale = networks.observation_scaling(spec)
@@ -180,8 +186,9 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
     the `d` inputs scaled to [0, 1]: the observation, and then the action.
 
     Raises:
-        ValueError: if the order is less than one, or an input has an infinite bound.
+        ValueError: if the order is less than one, or the observation has an infinite bound.
     """
+    checks.env_spec(spec)
     if order < 1:
         raise ValueError(f"a Fourier basis needs an order of one or more, got {order}")
     low, high = spec.observation_low, spec.observation_high

@@ -13,6 +13,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import checks
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.agents import densities
 from cmedirl_jax.agents.densities import ConditionalGaussian
@@ -168,10 +169,7 @@ def mixture(
     Raises:
         ValueError: if `snapshots` or `period` is not positive.
     """
-    if min(snapshots, period) < 1:
-        raise ValueError(
-            f"snapshots and snapshot_period must be positive, got {snapshots} and {period}"
-        )
+    checks.sizes(snapshots=snapshots, snapshot_period=period)
     # As many demonstrations as samples of the background.
     share = 0.5 if append else 0.0
     parts = _Mixture(spec, networks, exploration, source, snapshots, period, share)

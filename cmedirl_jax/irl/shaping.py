@@ -5,7 +5,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, ranges
 from cmedirl_jax.types import Numeric
 
 Shaping = Literal["additive", "potential", "alone"]
@@ -22,7 +22,7 @@ def additive(
         weight: `[]`, of r_D; lower it over time to anneal r_D.
 
     Raises:
-        ValueError: if the shapes differ, or the weight is not a scalar.
+        ValueError: if the shapes differ, or the weight is not a finite scalar.
         TypeError: if the rewards are not of floats.
     """
     _check(weight, environment_reward=environment_reward, learned_reward=learned_reward)
@@ -51,13 +51,15 @@ def potential(
         weight: `[]`, of the potential.
 
     Raises:
-        ValueError: if the shapes differ, or the discount or the weight is not a scalar.
+        ValueError: if the shapes differ, the weight is not a finite scalar, or the discount not one
+            between 0 and 1.
         TypeError: if `terminated` is not bool, or another array is not of floats.
     """
     _check(weight, environment_reward=environment_reward, before=before, after=after)
     checks.shape("terminated", terminated, jnp.shape(environment_reward))
     checks.kind("terminated", terminated, jnp.bool_)
     checks.shape("discount", discount, ())
+    checks.shares(discount=discount)
     following = jnp.where(terminated, 0.0, after)
     return environment_reward + weight * (discount * following - before)
 
@@ -67,3 +69,4 @@ def _check(weight: Numeric, **rewards: jax.Array) -> None:
         checks.shape(name, reward, jnp.shape(rewards["environment_reward"]))
         checks.kind(name, reward, jnp.floating)
     checks.shape("weight", weight, ())
+    checks.within(ranges.FINITE, weight=weight)

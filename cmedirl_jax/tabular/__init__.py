@@ -1,15 +1,18 @@
 """Maximum-entropy IRL and control with a model, by dynamic programming (Eqs. 1 and 4-9)."""
 
 from cmedirl_jax.tabular import discretise, imitation, interpolation, table_reward
+from cmedirl_jax.tabular.demonstrations import (
+    Steps,
+    TabularDemonstrations,
+    empirical_visitation,
+)
 from cmedirl_jax.tabular.dynamics import SparseDynamics
 from cmedirl_jax.tabular.fixed_point import Stop
 from cmedirl_jax.tabular.interpolation import Grid
 from cmedirl_jax.tabular.maxent import (
     MaxEntInfo,
     MaxEntResult,
-    TabularDemonstrations,
     deep_maxent_irl,
-    empirical_visitation,
     maxent_irl,
 )
 from cmedirl_jax.tabular.optimal_control import OptimalPolicy, value_iteration
@@ -22,6 +25,7 @@ __all__ = [
     "OptimalPolicy",
     "SoftPolicy",
     "SparseDynamics",
+    "Steps",
     "Stop",
     "TabularDemonstrations",
     "deep_maxent_irl",

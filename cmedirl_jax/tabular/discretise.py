@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmedirl_jax import checks
 from cmedirl_jax import grids as grids_lib
 from cmedirl_jax.envs import Env, Step
 from cmedirl_jax.tabular import interpolation
@@ -67,8 +68,7 @@ def make(
     """
     if env.state_at is None:
         raise ValueError(f"{env.spec.id} does not say which state an observation is of")
-    if subsamples < 1:
-        raise ValueError(f"subsamples must be at least 1, got {subsamples}")
+    checks.sizes(subsamples=subsamples)
     states, actions = grids(env.spec, state_shape, action_shape)
     within = (np.arange(subsamples) + 0.5) / subsamples - 0.5
     offsets = grids_lib.product(*[within] * len(states.shape))
@@ -185,6 +185,8 @@ def grids(
     Raises:
         ValueError: if a bound is infinite, or the shapes do not have the specification's sizes.
     """
+
+    checks.env_spec(spec)
 
     def over(low: np.ndarray, high: np.ndarray, shape: Sequence[int]) -> Grid:
         return Grid(tuple(map(float, low)), tuple(map(float, high)), tuple(shape))

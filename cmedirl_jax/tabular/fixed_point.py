@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import checks, ranges
 from cmedirl_jax.types import Numeric
 
 
@@ -26,7 +27,14 @@ class Stop(NamedTuple):
 def iterate(
     function: Callable[[jax.Array], jax.Array], guess: jax.Array, stop: Stop
 ) -> tuple[jax.Array, jax.Array]:
-    """Apply `function` `[...]` -> `[...]` until `stop`: the point, and the last relative change."""
+    """Apply `function` `[...]` -> `[...]` until `stop`: the point, and the last relative change.
+
+    Raises:
+        ValueError: if the tolerance is negative or not finite, or there is no iteration.
+        TypeError: if the number of iterations is not an integer.
+    """
+    checks.within(ranges.NOT_NEGATIVE, tolerance=stop.tolerance)
+    checks.sizes(iterations=stop.iterations)
 
     def going(carry):
         _, change, count = carry

@@ -21,15 +21,18 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from cmedirl_jax import checks, ranges
+from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.data.hot_start_data import HotStartData
 from cmedirl_jax.envs import Env
 from cmedirl_jax.irl import rewards
 from cmedirl_jax.ranges import AtLeastTwo, BelowOne, NotNegative, Positive, Size
 from cmedirl_jax.tabular import discretise, interpolation, maxent
+from cmedirl_jax.tabular.demonstrations import TabularDemonstrations
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.tabular.interpolation import Grid
-from cmedirl_jax.tabular.maxent import MaxEntResult, TabularDemonstrations
+from cmedirl_jax.tabular.maxent import MaxEntResult
 from cmedirl_jax.types import EnvSpec, Numeric
 
 Kind = Literal["linear", "deep"]
@@ -76,9 +79,10 @@ def discretised(
     """The environment on the settings' grid; `params` default to the environment's.
 
     Raises:
-        ValueError: what `discretise.make` raises.
+        ValueError: what `discretise.make` raises, or if a setting is out of range.
     """
     settings = settings or TabularSettings()
+    ranges.check(settings)
     states, actions = grids(env.spec, settings)
     return discretise.make(
         env, states.shape, actions.shape, params=params, subsamples=settings.subsamples
@@ -117,8 +121,14 @@ def fit(
         subset: which of them; default all.
         kind: "linear" or "deep".
         settings: every other choice.
+
+    Raises:
+        ValueError: as `visitation`, or if a setting is out of range.
     """
-    fit_one = functools.partial(_fit, spec=spec, kind=kind, settings=settings or TabularSettings())
+    settings = settings or TabularSettings()
+    ranges.check(settings)
+    _check_subset(data, subset)
+    fit_one = functools.partial(_fit, spec=spec, kind=kind, settings=settings)
     return jax.custom_batching.sequential_vmap(fit_one)(key, mdp, data, subset)
 
 
@@ -182,7 +192,13 @@ def visitation(
         data: the pool.
         subset: which of its demonstrations; default all.
         discount: gamma, per environment step.
+
+    Raises:
+        ValueError: if a known subset has no step, or an episode that the pool does not have, or the
+            discount is not between 0 and 1.
     """
+    checks.shares(discount=discount)
+    _check_subset(data, subset)
     pool = jax.tree.map(jnp.asarray, data.episodes)
     chosen = pool if subset is None else subset
     drawn = jnp.searchsorted(pool.start, chosen.start)
@@ -201,3 +217,16 @@ def visitation(
         empty.at[state[:, :, None], action[:, None, :]].add(both),
         empty[:, 0].at[state].add(starts),
     )
+
+
+def _check_subset(data: HotStartData, subset: DemonstrationSubset | None) -> None:
+    if subset is None:
+        return
+    demonstrations_lib.check_subset(subset)
+    if all(map(ranges.known, (*subset, *data.episodes))):
+        pool = set(zip(*(np.asarray(field).tolist() for field in data.episodes), strict=True))
+        for start, length in zip(*(np.asarray(field).tolist() for field in subset), strict=True):
+            if length and (start, length) not in pool:
+                raise ValueError(
+                    f"subset: the pool has no episode of {length} steps from step {start}"
+                )

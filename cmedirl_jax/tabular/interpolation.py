@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import grids
+from cmedirl_jax import checks, grids
 from cmedirl_jax.types import Array
 
 
@@ -33,8 +33,11 @@ class Grid:
             )
         if min(self.shape, default=0) < 2:
             raise ValueError(f"a grid needs two points along each dimension, got {self.shape}")
+        checks.sizes(**{f"shape[{axis}]": points for axis, points in enumerate(self.shape)})
         if not np.isfinite([*self.low, *self.high]).all():
             raise ValueError(f"a grid needs finite bounds, got {self.low} and {self.high}")
+        if not np.all(np.less(self.low, self.high)):
+            raise ValueError(f"a grid's low must be below its high, got {self.low} and {self.high}")
 
     @property
     def size(self) -> int:

@@ -1,6 +1,6 @@
 """Maximum-entropy IRL with a model: linear (Ziebart et al. 2008), deep (Wulfmeier et al. 2015).
 
-    demonstrations = empirical_visitation(state, action, mask, (S, A), discount=0.99)
+    demonstrations = tabular.empirical_visitation(state, action, mask, (S, A), discount=0.99)
     result = maxent_irl(dynamics, features, demonstrations, discount=0.99)
     result.reward, result.policy
 
@@ -17,34 +17,25 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, ranges
+from cmedirl_jax.tabular import demonstrations as demonstrations_lib
 from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import soft_control
+from cmedirl_jax.tabular.demonstrations import TabularDemonstrations
 from cmedirl_jax.tabular.dynamics import Dynamics
 from cmedirl_jax.tabular.fixed_point import Stop
 from cmedirl_jax.tabular.soft_control import SoftPolicy
 from cmedirl_jax.types import Array, Network, Numeric, Params
 
 
-class TabularDemonstrations(NamedTuple):
-    """The visits and the starts of the demonstrations.
-
-    Attributes:
-        visitation: `[S, A]`, mu_D(s, a) = 1/N sum_i sum_t gamma^t 1[(s_t, a_t) = (s, a)].
-        initial: `[S]`, the distribution of their first states.
-    """
-
-    visitation: jax.Array
-    initial: jax.Array
-
-
 class MaxEntInfo(NamedTuple):
     """Diagnostics of each step, of the parameters before it.
 
     Attributes:
-        log_likelihood: `[steps]`, (mu_D . r - sum_s D_0(s) V_0(s)) / alpha. With deterministic
-            dynamics it is the demonstrations' discounted causal log-likelihood, otherwise the
-            expectation of that over the dynamics.
+        log_likelihood: `[steps]`, 1/N sum_i sum_t gamma^t log pi_t(a_t | s_t), never positive. It
+            is what the fit maximises if the dynamics are deterministic, and otherwise in the limit
+            of many demonstrations. With a horizon and without `demonstrations.steps`, it is that
+            limit, (mu_D . r - sum_s D_0(s) V_0(s)) / alpha.
         log_prior: `[steps]`, -(lambda / 2) ||theta||^2.
         visitation_error: `[steps]`, sum_{s,a} |mu_D - E[mu]|.
         residual: `[steps]`, see `SoftPolicy`.
@@ -90,6 +81,10 @@ def maxent_irl(
 ) -> MaxEntResult:
     """Fit r = theta^T phi (Eq. 1) from theta = 0. L is concave in theta: any maximum is global.
 
+    Demonstrations of different lengths need absorbing states: with a horizon alone, all have as
+    many steps. Where the dynamics are random, a few demonstrations have visits that no policy has
+    on average; there may then be no maximum without a prior, and theta grows from step to step.
+
     Args:
         dynamics: P(s'|s,a).
         features: phi, `[S, F]` for a reward of states or `[S, A, F]`.
@@ -105,11 +100,14 @@ def maxent_irl(
         stop: when the fixed points' iterations end, if there is no horizon.
 
     Raises:
-        ValueError: if the shapes do not fit each other, or a size is not positive.
+        ValueError: if the shapes do not fit each other, a size is not positive, a value that is
+            not traced is out of range, or the demonstrations are not trajectories of the process
+            (an early end where no absorbing state follows, an impossible transition).
         TypeError: for wrong dtypes.
     """
     features, size = jnp.asarray(features), jnp.shape(demonstrations.visitation)
     checks.kind("features", features, jnp.floating)
+    checks.within(ranges.FINITE, features=features)
     if features.ndim < 2 or features.shape[:-1] not in (size[:1], size):
         raise ValueError(
             f"expected features [S, F] or [S, A, F] beside a visitation {size}, "
@@ -161,13 +159,18 @@ def deep_maxent_irl(
         dynamics: this and the rest as in `maxent_irl`; the default optimiser is Adam at 0.01.
 
     Raises:
-        ValueError: if the shapes do not fit each other, or a size is not positive.
+        ValueError: as `maxent_irl`.
         TypeError: for wrong dtypes.
     """
     checks.sizes(steps=steps)
-    visited, initial = demonstrations
-    dynamics_lib.check(dynamics, jnp.shape(visited), initial=initial, absorbing=absorbing)
-    checks.kind("visitation", visited, jnp.floating)
+    checks.within(ranges.NOT_NEGATIVE, prior_precision=prior_precision)
+    checks.within(ranges.FINITE, **{f"inputs[{i}]": array for i, array in enumerate(inputs)})
+    initial, size = demonstrations.initial, jnp.shape(demonstrations.visitation)
+    dynamics_lib.check(dynamics, size, initial=initial, absorbing=absorbing)
+    dynamics_lib.check_control(discount, horizon, temperature)
+    demonstrations_lib.check(
+        demonstrations, dynamics, discount=discount, horizon=horizon, absorbing=absorbing
+    )
     problem = _Problem(
         network=network,
         inputs=inputs,
@@ -232,7 +235,7 @@ def _step(
         state,
         params,
         # For optimisers that search along a line.
-        value=-info.log_likelihood - info.log_prior,
+        value=-_objective(problem, reward, policy) - info.log_prior,
         grad=gradient,
         value_fn=functools.partial(_negative_posterior, problem, values),
     )
@@ -267,10 +270,23 @@ def _visitation(problem: _Problem, policy: SoftPolicy, guess: jax.Array) -> jax.
     )
 
 
-def _log_likelihood(problem: _Problem, reward: jax.Array, policy: SoftPolicy) -> jax.Array:
-    visited, initial = problem.demonstrations
+def _objective(problem: _Problem, reward: jax.Array, policy: SoftPolicy) -> jax.Array:
+    """(mu_D . r - sum_s D_0(s) V_0(s)) / alpha, whose gradient is Eq. 8."""
+    visited, initial, _ = problem.demonstrations
     first = policy.values if problem.control["horizon"] is None else policy.values[0]
     return (jnp.sum(visited * reward) - initial @ first) / problem.temperature
+
+
+def _log_likelihood(problem: _Problem, reward: jax.Array, policy: SoftPolicy) -> jax.Array:
+    visited, _, steps = problem.demonstrations
+    log_pi = policy.log_probabilities
+    if problem.control["horizon"] is None:
+        return jnp.sum(jnp.where(visited > 0, visited * log_pi, 0.0))
+    if steps is None:
+        return _objective(problem, reward, policy)
+    time = jnp.arange(steps.mask.shape[1])
+    taken = problem.control["discount"] ** time * log_pi[time, steps.state, steps.action]
+    return jnp.sum(jnp.where(steps.mask, taken, 0.0)) / steps.mask.shape[0]
 
 
 def _log_prior(problem: _Problem, params: Params) -> jax.Array:
@@ -281,27 +297,4 @@ def _negative_posterior(problem: _Problem, guess: jax.Array, params: Params) -> 
     """The loss `[]` at other parameters; `guess` is where the values' iteration begins."""
     reward = _reward(problem, params)
     policy = _soft_policy(problem, reward, guess)
-    return -_log_likelihood(problem, reward, policy) - _log_prior(problem, params)
-
-
-def empirical_visitation(
-    state: Array, action: Array, mask: Array, size: tuple[int, int], *, discount: Numeric
-) -> TabularDemonstrations:
-    """Count demonstrations: mu_D and D_0.
-
-    Without a horizon the demonstrations have to end in absorbing states. One that is cut off after
-    T steps adds an error of the order of gamma^T to the gradient.
-
-    Args:
-        state: `[N, T]` int.
-        action: `[N, T]` int.
-        mask: `[N, T]` bool, False past a demonstration's end; its first step is never past it.
-        size: (S, A).
-        discount: gamma, per step.
-    """
-    mask = jnp.asarray(mask)
-    weight = mask * jnp.asarray(discount) ** jnp.arange(mask.shape[1]) / mask.shape[0]
-    return TabularDemonstrations(
-        jnp.zeros(size, weight.dtype).at[state, action].add(weight),
-        jnp.zeros(size[0], weight.dtype).at[jnp.asarray(state)[:, 0]].add(1.0 / mask.shape[0]),
-    )
+    return -_objective(problem, reward, policy) - _log_prior(problem, params)

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import checks
 from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import fixed_point
 from cmedirl_jax.tabular.dynamics import Dynamics
@@ -42,12 +41,13 @@ def value_iteration(
     The arguments are those of `soft_value_iteration`.
 
     Raises:
-        ValueError: if the shapes do not fit each other, or the horizon is below 1.
+        ValueError: if the shapes do not fit each other, the horizon is below 1, or a value that is
+            not traced is out of range.
         TypeError: for wrong dtypes.
     """
     dynamics_lib.check(dynamics, jnp.shape(reward), absorbing=absorbing)
-    checks.kind("reward", reward, jnp.floating)
-    dynamics_lib.check_horizon(horizon)
+    dynamics_lib.check_reward(reward)
+    dynamics_lib.check_control(discount, horizon)
 
     def action_values(values: jax.Array) -> jax.Array:
         return reward + discount * dynamics_lib.expected_next(dynamics, values)

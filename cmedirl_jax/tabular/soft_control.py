@@ -15,7 +15,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import checks
 from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import fixed_point
 from cmedirl_jax.tabular.dynamics import Dynamics
@@ -56,7 +55,7 @@ def soft_value_iteration(
     Args:
         dynamics: P(s'|s,a).
         reward: `[S, A]`.
-        discount: gamma, per step; below 1 for an infinite horizon.
+        discount: gamma, per step, between 0 and 1; below 1 for an infinite horizon.
         horizon: steps T of an episode, with V_T = 0; None: infinite, by a fixed point.
         temperature: alpha, above 0.
         absorbing: `[S]` bool, the states in which an episode is over: there is no reward, no action
@@ -65,12 +64,13 @@ def soft_value_iteration(
         guess: `[S]`, values at which that iteration begins; default zeros.
 
     Raises:
-        ValueError: if the shapes do not fit each other, or the horizon is below 1.
+        ValueError: if the shapes do not fit each other, the horizon is below 1, or a value that is
+            not traced is out of range (probabilities that do not sum to 1, a NaN).
         TypeError: for wrong dtypes.
     """
     dynamics_lib.check(dynamics, jnp.shape(reward), absorbing=absorbing, guess=guess)
-    checks.kind("reward", reward, jnp.floating)
-    dynamics_lib.check_horizon(horizon)
+    dynamics_lib.check_reward(reward)
+    dynamics_lib.check_control(discount, horizon, temperature)
 
     def back_up(values: jax.Array) -> tuple[jax.Array, jax.Array]:
         q = reward + discount * dynamics_lib.expected_next(dynamics, values)
@@ -119,9 +119,11 @@ def expected_visitation(
         guess: `[S]`, discounted visits at which that iteration begins; default `initial`.
 
     Raises:
-        ValueError: if the policy is for another horizon, or the shapes do not fit each other.
+        ValueError: if the policy is for another horizon, the shapes do not fit each other, or a
+            value that is not traced is out of range.
         TypeError: for wrong dtypes.
     """
+    dynamics_lib.check_control(discount, horizon)
     steps = () if horizon is None else (horizon,)
     size = policy.log_probabilities.shape[-2:]
     if policy.log_probabilities.shape != (*steps, *size):

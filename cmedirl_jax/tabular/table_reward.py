@@ -5,7 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, ranges
 from cmedirl_jax.irl import IRLHParams, RewardLearner, RewardState, base
 from cmedirl_jax.optimizers import traced
 from cmedirl_jax.tabular import interpolation
@@ -52,7 +52,14 @@ def state(table: jax.Array, hparams: IRLHParams) -> RewardState:
     Args:
         table: `[states.size, actions.size]`, without a row for the absorbing state.
         hparams: only `bound` is read.
+
+    Raises:
+        ValueError: if a known entry is not finite, or the bound is out of range.
+        TypeError: if the table is not of floats.
     """
+    checks.kind("table", table, jnp.floating)
+    checks.within(ranges.FINITE, table=table)
+    ranges.check(hparams)
     largest = jnp.max(jnp.abs(table))
     scaled = hparams.bound * table / jnp.where(largest > 0, largest, 1.0)
     return RewardState(scaled, (), traced(hparams))

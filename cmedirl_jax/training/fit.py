@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import checks
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.demonstrations import Demonstrations
@@ -67,8 +68,12 @@ def fit(
     """
     if isinstance(method, str):
         method = METHODS[method]
-    if min(seeds, steps, evaluate_every, evaluation_starts) < 1:
-        raise ValueError("seeds, steps, evaluate_every and evaluation_starts must be positive")
+    checks.sizes(
+        seeds=seeds,
+        steps=steps,
+        evaluate_every=evaluate_every,
+        evaluation_starts=evaluation_starts,
+    )
     if steps % evaluate_every:
         raise ValueError(f"steps ({steps}) must be a multiple of evaluate_every ({evaluate_every})")
     settings = settings or Settings()

@@ -107,6 +107,30 @@ def test_subsets_that_contradict_themselves_are_refused(change, error, message):
         demonstrations.sample_episodes(KEY, subset, 3)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"start": np.array([4, 8, -1, 0])}, r"start must be at least 0, got -1 at \[2\]"),
+        ({"length": np.array([4, 0, -6, 0])}, r"length must be at least 0, got -6 at \[2\]"),
+        ({"length": np.zeros(4, int)}, "length: expected a positive one"),
+    ],
+)
+def test_subsets_of_no_steps_are_refused(change, message):
+    subset = SUBSET._replace(**change)
+    for draw in (demonstrations.sample_index, demonstrations.sample_episodes):
+        with pytest.raises(ValueError, match=rf"subset\.{message}"):
+            draw(KEY, subset, 3)
+
+
+def test_steps_beyond_a_pool_are_refused():
+    pool = pools.random_pool([3, 4]).transition
+    with pytest.raises(ValueError, match="an episode ends at step 8, the pool has 7 steps"):
+        demonstrations.sample(KEY, pool, DemonstrationSubset(np.array([3]), np.array([5])), 2)
+    for index in (-1, 7):
+        with pytest.raises(ValueError, match=f"index must be .* below 7, got {index}"):
+            demonstrations.at(pool, np.array(index))
+
+
 def test_negative_sample_sizes_are_refused():
     with pytest.raises(ValueError, match="batch_size must be at least 0, got -1"):
         demonstrations.sample_index(KEY, SUBSET, -1)

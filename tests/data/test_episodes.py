@@ -106,7 +106,7 @@ def test_vmapped_rings_do_not_mix():
 
 @pytest.mark.parametrize("sizes", [(0, 7, 4), (3, 0, 4), (3, 7, 0)])
 def test_sizes_must_be_positive(sizes):
-    with pytest.raises(ValueError, match="must be positive"):
+    with pytest.raises(ValueError, match="must be at least 1, got 0"):
         episodes.make(*sizes)
 
 

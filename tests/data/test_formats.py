@@ -141,14 +141,17 @@ def header(**changes):
         ({"action": np.zeros((7, 1), np.float32)}, "action has shape"),
         ({"reward": np.zeros((8, 1), np.float32)}, "reward must be"),
         ({"next_observation": np.zeros((8, 3), np.float32)}, "differ in shape"),
-        ({"terminated": np.zeros(8, np.float32)}, "terminated has dtype float32"),
-        ({"reward": np.zeros(8, np.int32)}, "reward has dtype int32"),
+        ({"terminated": np.zeros(8, np.float32)}, "terminated has dtype float32, expected bool"),
+        ({"reward": np.zeros(8, np.int32)}, "reward has dtype int32, expected floats"),
         ({"reward": np.full(8, 1e300)}, "reward holds values that are not finite"),
         ({"next_observation": np.full((8, 2), -np.inf, np.float32)}, "next_observation holds"),
         ({"action": np.full((8, 1), np.nan, np.float32)}, "action holds values"),
         ({"action": np.full((8, 1), -1.01, np.float32)}, r"action\[0\] is -1\.01"),
         ({"truncated": np.zeros(8, np.int8)}, "truncated has dtype int8"),
-        ({"episode": np.zeros(8, np.float32)}, "episode has dtype float32"),
+        (
+            {"episode": np.zeros(8, np.float32)},
+            "episode has dtype float32, expected signed integers",
+        ),
         ({"episode": np.zeros(8, np.uint8)}, "episode has dtype uint8"),
         ({"episode": np.array([0, 0, 0, 2, 1, 1, 1, 1], np.int32)}, "without gaps"),
         ({"episode": np.array([1, 1, 1, 2, 3, 3, 3, 3], np.int32)}, "without gaps"),
@@ -301,7 +304,7 @@ def test_a_highly_compressible_pool_loads(path):
         Transition(zeros[:, None], zeros[:, None], zeros, zeros[:, None], zeros.astype(bool)),
         zeros.astype(bool),
         zeros.astype(np.int32),
-        {},
+        POOL.metadata,
     )
     demonstrations.save(path, pool)
     assert path.stat().st_size < 100_000
@@ -344,7 +347,7 @@ def disk_full(file, **arrays):
 
 
 UNENDED = POOL._replace(truncated=np.zeros(8, bool))
-UNWRITABLE = POOL._replace(metadata={"env": object()})
+UNWRITABLE = POOL._replace(metadata=POOL.metadata | {"expert": object()})
 
 
 @pytest.mark.parametrize(
@@ -370,5 +373,14 @@ def test_a_failed_save_leaves_nothing_and_keeps_an_old_file(
 
 
 def test_arrays_on_the_device_can_be_saved(path):
-    demonstrations.save(path, jax.tree.map(jnp.asarray, POOL._replace(metadata={})))
-    assert_equal(demonstrations.load(path), POOL._replace(metadata={}))
+    on_device = jax.tree.map(jnp.asarray, POOL._replace(metadata=None))
+    demonstrations.save(path, on_device._replace(metadata=POOL.metadata))
+    assert_equal(demonstrations.load(path), POOL)
+
+
+@pytest.mark.parametrize("metadata", [{}, {"env": None}, None, [SPEC.id]])
+def test_a_pool_without_its_environments_name_is_not_saved(tmp_path, metadata):
+    """`load` would refuse it."""
+    with pytest.raises(ValueError, match=r"metadata\['env'\]: expected the env.* name, got"):
+        demonstrations.save(tmp_path / "pool.npz", POOL._replace(metadata=metadata))
+    assert not list(tmp_path.iterdir())

@@ -136,7 +136,7 @@ def test_an_empty_buffer_gives_zeros():
 
 @pytest.mark.parametrize("capacity", [0, -1])
 def test_capacity_must_be_positive(capacity):
-    with pytest.raises(ValueError, match=f"positive, got {capacity}"):
+    with pytest.raises(ValueError, match=f"capacity must be at least 1, got {capacity}"):
         replay.make(SPEC, capacity)
 
 

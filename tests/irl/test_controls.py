@@ -87,8 +87,7 @@ def test_each_seed_has_its_own_random_reward():
     np.testing.assert_array_equal(jax.vmap(constant.init)(keys).params, np.float32([0.1] * 3))
 
 
-@pytest.mark.parametrize("bound", ["observation_low", "action_high"])
-def test_infinite_bounds_are_refused(bound):
-    spec = SPEC._replace(**{bound: np.full_like(getattr(SPEC, bound), np.inf)})
+def test_infinite_bounds_are_refused():
+    spec = SPEC._replace(observation_low=np.float32([-np.inf, -0.07]))
     with pytest.raises(ValueError, match=r"MountainCarContinuous-v0: .* finite bounds"):
         controls.random(spec, network=rewards.mlp(SPEC))

@@ -55,5 +55,5 @@ def test_seeds_in_step_keep_their_own():
 def test_numbers_must_be_positive(name):
     settings = RewardBatchSettings(weights="fusion", **{name: 0})
     parts = SPEC, NETWORKS, BEHAVIOURS["epsilon-greedy"], REPLAY, CAPACITY
-    with pytest.raises(ValueError, match="must be positive"):
+    with pytest.raises(ValueError, match=f"^{name} must be at least 1, got 0"):
         reward_batches.make(*parts, settings, objective="trajectory", append=True)

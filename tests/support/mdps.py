@@ -85,3 +85,26 @@ def counted_visits(weighted, discount, shape):
         for time, pair in enumerate(pairs):
             visits[pair] += probability * discount**time
     return visits
+
+
+def demonstrate(dynamics, starts, length, ends, seed):
+    """One list of (state, action) per start, by a policy that is optimal for no reward."""
+    rng = np.random.default_rng(seed)
+    states, actions, _ = dynamics.shape
+    demonstrations = []
+    for state in starts:
+        pairs = []
+        while len(pairs) < length and not (ends is not None and ends[state]):
+            action = rng.integers(actions)
+            pairs.append((state, action))
+            state = rng.choice(states, p=dynamics[state, action])
+        demonstrations.append(pairs)
+    return demonstrations
+
+
+def padded(demonstrations, length):
+    """`(state, action, mask)`, each `[N, length]`, with -1 past an end."""
+    steps = np.full((2, len(demonstrations), length), -1)
+    for row, pairs in enumerate(demonstrations):
+        steps[:, row, : len(pairs)] = np.transpose(pairs)
+    return *steps, steps[0] >= 0

@@ -59,6 +59,23 @@ def test_visitation_counts_discounted_steps_where_they_were(data, mdp, chosen):
     assert (visits[-1] == 0).all()
 
 
+@pytest.mark.parametrize(
+    ("start", "length", "message"),
+    [
+        ([0], [3], "the pool has no episode of 3 steps from step 0"),
+        ([1], [90], "the pool has no episode of 90 steps from step 1"),
+        ([-1], [90], "subset.start must be at least 0, got -1"),
+        ([0], [0], "subset.length: expected a positive one"),
+    ],
+)
+def test_episodes_that_the_pool_does_not_have_are_refused(data, mdp, start, length, message):
+    subset = DemonstrationSubset(np.array(start), np.array(length))
+    with pytest.raises(ValueError, match=message):
+        imitation.visitation(mdp, data, subset, discount=0.9)
+    with pytest.raises(ValueError, match=message):
+        imitation.fit(jax.random.key(0), mdp, pools.ENV.spec, data, subset, kind="linear")
+
+
 @pytest.mark.parametrize("reward", ["state", "state-action"])
 @pytest.mark.parametrize("kind", ["linear", "deep"])
 def test_every_reward_is_fitted_and_vmaps(data, mdp, kind, reward):

@@ -44,6 +44,8 @@ def test_grid_points_interpolate_to_themselves():
         ((0.0,), (1.0, 2.0), (3,), "as many bounds as sizes"),
         ((0.0,), (1.0,), (1,), "two points"),
         ((0.0,), (np.inf,), (3,), "finite bounds"),
+        ((1.0,), (0.0,), (3,), "low must be below its high"),
+        ((0.0, 0.0), (1.0, 0.0), (3, 3), "low must be below its high"),
     ],
 )
 def test_impossible_grids_are_refused(low, high, shape, message):

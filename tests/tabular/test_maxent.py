@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cmedirl_jax import networks, tabular
 from cmedirl_jax.tabular import Stop, TabularDemonstrations
@@ -38,15 +40,6 @@ def two_layers(inputs, hidden=32):
         return jax.tree.map(lambda leaf: leaf.astype(float), mlp.init(key, jnp.zeros((1, inputs))))
 
     return networks.scalar_output(Network(init, mlp.apply))
-
-
-def test_empirical_visitation_counts():
-    state = np.array([[0, 1, 1], [2, 0, 0]])
-    action = np.array([[1, 0, 1], [1, 1, 0]])
-    mask = np.array([[True, True, True], [True, False, False]])
-    counted = tabular.empirical_visitation(state, action, mask, (3, 2), discount=0.5)
-    np.testing.assert_allclose(counted.visitation, [[0, 0.5], [0.25, 0.125], [0, 0.5]])
-    np.testing.assert_allclose(counted.initial, [0.5, 0, 0.5])
 
 
 @pytest.mark.parametrize("temperature", [1.0, 0.5])
@@ -127,6 +120,77 @@ def test_the_optimum_matches_the_demonstrations_visitation(optimizer):
     np.testing.assert_allclose(result.visitation, demonstrations.visitation, atol=1e-4)
     assert result.info.log_likelihood[-1] >= result.info.log_likelihood.max() - 1e-9
     assert result.info.visitation_error[-1] < 1e-3 < result.info.visitation_error[0]
+
+
+@functools.cache
+def compiled_likelihood(horizon):
+    """Its log-likelihood of demonstrations under a given reward `[S, A]`."""
+
+    @jax.jit
+    def likelihood(dynamics, reward, ends, steps, discount):
+        demonstrations = tabular.empirical_visitation(*steps, reward.shape, discount=discount)
+        result = tabular.deep_maxent_irl(
+            jax.random.key(0),
+            Network(lambda key: reward, lambda reward: reward),
+            (),
+            dynamics,
+            demonstrations,
+            discount=discount,
+            horizon=horizon,
+            absorbing=ends,
+            optimizer=optax.sgd(0.0),
+            steps=1,
+            stop=EXACT,
+        )
+        return result.info.log_likelihood[0]
+
+    return likelihood
+
+
+@given(
+    st.integers(0, 1000),
+    st.booleans(),
+    st.sampled_from([None, 5]),
+    st.sampled_from([0.5, 0.9]),
+    st.sampled_from([0.3, 30.0]),
+)
+def test_the_likelihood_of_demonstrations_of_any_lengths_is_never_positive(
+    seed, deterministic, horizon, discount, scale
+):
+    """Against its sum over the steps; the episodes end in an absorbing state, or at the horizon."""
+    dynamics, reward, _, ends = mdps.random_mdp(seed, deterministic=deterministic, absorbing=True)
+    reward = scale * reward
+    demonstrations = mdps.demonstrate(dynamics, [0, 1, 2, 1], horizon or 60, ends, seed)
+    _, policy = mdps.soft_backups(dynamics, reward, discount, horizon or 200, absorbing=ends)
+    expected = np.mean(
+        [
+            sum(
+                discount**time * np.log(policy[time if horizon else 0][pair])
+                for time, pair in enumerate(pairs)
+            )
+            for pairs in demonstrations
+        ]
+    )
+    steps = mdps.padded(demonstrations, 60)
+    with jax.enable_x64(True):
+        found = compiled_likelihood(horizon)(dynamics, reward, ends, steps, discount)
+    assert found <= 0.0
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_the_likelihood_equals_that_among_all_trajectories():
+    """Undiscounted and deterministic: exp(return) over the sum of that from the same start."""
+    dynamics, reward, _, ends = mdps.random_mdp(5, deterministic=True, absorbing=True)
+    demonstrations = mdps.demonstrate(dynamics, [0, 1, 2, 1, 0], 5, ends, seed=1)
+    assert len({len(pairs) for pairs in demonstrations}) > 2
+    logs = []
+    for pairs in demonstrations:
+        every = mdps.trajectories(dynamics, np.ones((5, 4, 3)), np.eye(4)[pairs[0][0]], ends)
+        returns = [sum(reward[pair] for pair in path) for weight, path in every if weight]
+        logs.append(sum(reward[pair] for pair in pairs) - np.log(np.sum(np.exp(returns))))
+    steps = mdps.padded(demonstrations, 60)
+    found = compiled_likelihood(5)(dynamics, reward, ends, steps, 1.0)
+    np.testing.assert_allclose(found, np.mean(logs), rtol=1e-9)
 
 
 @pytest.mark.parametrize("slip", [0.0, 0.2])

@@ -123,19 +123,6 @@ def likelihood(dynamics, demonstrations, reward, discount, **kwargs):
     return total / len(demonstrations)
 
 
-def demonstrate(dynamics, starts, length, ends, seed):
-    """One demonstration per start, by a policy that is optimal for no reward."""
-    rng = np.random.default_rng(seed)
-    states, actions, _ = dynamics.shape
-    for state in starts:
-        pairs = []
-        while len(pairs) < length and not (ends is not None and ends[state]):
-            action = rng.integers(actions)
-            pairs.append((state, action))
-            state = rng.choice(states, p=dynamics[state, action])
-        yield pairs
-
-
 @pytest.mark.parametrize(
     ("discount", "horizon", "absorbing"),
     [
@@ -150,7 +137,7 @@ def test_the_likelihoods_gradient_is_the_difference_in_visitation(discount, hori
     """
     dynamics, reward, _, ends = mdps.random_mdp(4, 5, deterministic=True, absorbing=absorbing)
     starts = [0, 1, 1, 3, 2, 0]
-    demonstrations = list(demonstrate(dynamics, starts, horizon or 1000, ends, seed=0))
+    demonstrations = mdps.demonstrate(dynamics, starts, horizon or 1000, ends, seed=0)
     kwargs = {"discount": discount, "horizon": horizon, "absorbing": ends}
     gradient = jax.grad(lambda r: likelihood(dynamics, demonstrations, r, **kwargs))(
         jnp.asarray(reward)

@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from cmedirl_jax.irl import IRLHParams, shaping
 from cmedirl_jax.tabular import discretise, interpolation, table_reward
@@ -34,6 +35,11 @@ def test_it_learns_nothing():
     nothing = LEARNER.reward(LEARNER.init(jax.random.key(0)), *batch[:2])
     assert nothing.tolist() == [0.0] * 4
     np.testing.assert_array_equal(shaping.additive(batch.reward, nothing), batch.reward)
+
+
+def test_a_table_with_a_nan_is_refused():
+    with pytest.raises(ValueError, match=r"table must be finite, got nan at \[0, 0\]"):
+        table_reward.state(jnp.full((30, 3), jnp.nan), IRLHParams())
 
 
 def test_a_table_of_zeros_stays_zero():

@@ -24,5 +24,7 @@ def test_fit_trains_and_evaluates_all_seeds():
         fit(jax.random.key(0), ENV, "hs-ddpg", elsewhere)
     with pytest.raises(ValueError, match="needs demonstrations"):
         fit(jax.random.key(0), ENV, "me-ddpg")
+    with pytest.raises(ValueError, match="seeds must be at least 1, got 0"):
+        training.fit(jax.random.key(0), ENV, "ddpg", seeds=0, steps=300)
     with pytest.raises(ValueError, match="multiple of evaluate_every"):
         training.fit(jax.random.key(0), ENV, "ddpg", seeds=1, steps=300)
