@@ -16,7 +16,7 @@ from cmedirl_jax.runs import run as run_lib
 from cmedirl_jax.runs import start, validation
 from cmedirl_jax.runs.cluster import processes
 from cmedirl_jax.runs.config import StudyConfig
-from cmedirl_jax.runs.console import compile_cache, signals, streams
+from cmedirl_jax.runs.console import compile_cache, screen, signals, streams
 from cmedirl_jax.runs.errors import Interrupted, UserError
 from cmedirl_jax.runs.storage import plain
 from experiments.presets import PRESETS
@@ -27,15 +27,10 @@ _OF_A_PROCESS = ("out", "coordinator", "process_id")
 """The options in which the processes of one run may differ."""
 
 
+@streams.flushed()
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    try:
-        return _main(sys.argv[1:] if arguments is None else arguments)
-    finally:
-        streams.flush()
-
-
-def _main(arguments: Sequence[str]) -> int:
+    arguments = sys.argv[1:] if arguments is None else arguments
     config = parse(arguments)
     try:
         processes.check(config.cluster)
@@ -50,9 +45,7 @@ def _main(arguments: Sequence[str]) -> int:
 
 def work(config: StudyConfig) -> int:
     """Do the run, or this process's share of it; returns the exit code."""
-    console = Console(file=streams.dispensable())
-    if not console.is_terminal:
-        console = Console(file=streams.dispensable(), width=120)
+    console = screen.console()
     compile_cache.use_cache()
     same = {k: v for k, v in plain.plain(config).items() if k not in _OF_A_PROCESS}
     try:
@@ -60,7 +53,10 @@ def work(config: StudyConfig) -> int:
         console.quiet = not cluster.writer
         with signals.noted(None if console.quiet else _STOPPING, cluster) as interruption:
             plan = validation.plan(config, cluster)
-            summary = run_lib.run(plan, devices, console, interruption, _conclude, cluster)
+            # Matplotlib and scipy take a second to import: a refusal does not wait for them.
+            from experiments import report
+
+            concluded = run_lib.run(plan, devices, console, interruption, report.report, cluster)
     except UserError as error:
         return _end(2, str(error))
     except Interrupted as error:
@@ -69,25 +65,20 @@ def work(config: StudyConfig) -> int:
         return _end(130, f"stopped at once; {_CONTINUE}")
     except OSError as error:
         return _end(1, f"{error}; what is finished is kept: {_CONTINUE}")
-    if summary is not None:
-        _print(console, summary, plan.folder)
+    if concluded is not None:
+        _print(console, concluded.summary, plan.folder)
+        for line in concluded.wrong:
+            streams.complain(f"run_grid: {line}; the results stand, and {_CONTINUE}")
     return 0
 
 
 def _print(console: Console, summary: pl.DataFrame, folder: Path) -> None:
-    console.print(summary_table(summary))
+    screen.show(console, summary_table(summary))
     difference = summary["gymnasium_difference_max"].max()
     console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
     if summary["diverged"].sum():
         console.print(f"Seeds that diverged and were stopped: {summary['diverged'].sum()}")
-    console.print(f"Tables and figures: {folder}", markup=False, highlight=False, soft_wrap=True)
-
-
-def _conclude(folder: Path) -> pl.DataFrame:
-    # Matplotlib and scipy take a second to import: a refusal does not wait for them.
-    from experiments import report
-
-    return report.report(folder)
+    screen.say(console, f"Tables and figures: {folder}")
 
 
 def _end(exit_code: int, line: str) -> int:

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import tempfile
 from pathlib import Path
 
 
@@ -14,6 +15,17 @@ def replace(partial: Path, path: Path) -> None:
     flush(partial)
     os.replace(partial, path)
     flush_name(path)
+
+
+def check_writable(folder: Path) -> None:
+    """Check that files can be written in a folder, which may not be there yet; leaves none.
+
+    Raises:
+        OSError: if they cannot.
+    """
+    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    with tempfile.TemporaryFile(dir=nearest):
+        pass
 
 
 def flush(path: Path) -> None:

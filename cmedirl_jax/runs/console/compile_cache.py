@@ -7,6 +7,8 @@ from collections.abc import Iterator
 import jax
 import platformdirs
 
+from cmedirl_jax.io import atomic
+
 _DURATIONS = (
     "/jax/core/compile/jaxpr_trace_duration",
     "/jax/core/compile/jaxpr_to_mlir_module_duration",
@@ -54,9 +56,16 @@ def counted() -> Iterator[Cost]:
 
 
 def use_cache() -> None:
-    """Keep compiled programs in the user's cache folder, unless JAX was told where to keep them."""
+    """Keep compiled programs in the user's cache folder, unless JAX was told where to keep them.
+
+    Where the user has no home, or none that can be written, they are compiled at every start.
+    """
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
-        folder = platformdirs.user_cache_path("cmedirl_jax", appauthor=False) / "compiled"
+        try:
+            folder = platformdirs.user_cache_path("cmedirl_jax", appauthor=False) / "compiled"
+            atomic.check_writable(folder)
+        except (OSError, RuntimeError):
+            return
         jax.config.update("jax_compilation_cache_dir", str(folder))
     # Small programs too: there are many, and each would be compiled at every start.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
-from cmedirl_jax.runs.console import compile_cache
+from cmedirl_jax.runs.console import compile_cache, screen
 
 PLAIN_INTERVAL = 10.0
 """Seconds between plain lines."""
@@ -135,7 +135,7 @@ class _Plain:
 
     def start(self, name: str) -> None:
         self.pace.start(name)
-        self._print(self.pace.title)
+        screen.say(self.console, self.pace.title)
 
     def go_on(self, learning_steps: int) -> None:
         self.pace.go_on(learning_steps)
@@ -144,7 +144,4 @@ class _Plain:
         self.pace.advance(learning_steps)
         if self.pace.reported - self.printed >= PLAIN_INTERVAL:
             self.printed = self.pace.reported
-            self._print(self.pace.line(solved_fraction))
-
-    def _print(self, line: str) -> None:
-        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
+            screen.say(self.console, self.pace.line(solved_fraction))

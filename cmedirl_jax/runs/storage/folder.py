@@ -5,13 +5,13 @@ import hashlib
 import importlib.metadata
 import json
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import filelock
 
+from cmedirl_jax.io import atomic
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import cells, checkpoints, sealing
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
@@ -52,9 +52,7 @@ def check(folder: Path, config: dict[str, Any]) -> None:
         for name in FOLDERS:
             if (folder / name).exists() and not (folder / name).is_dir():
                 raise UserError(f"--out: {folder / name} is in the way; a folder belongs there")
-        nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-        with tempfile.TemporaryFile(dir=nearest):
-            pass
+        atomic.check_writable(folder)
     except OSError as error:
         raise UserError(f"--out: cannot write to {folder} ({error.strerror})") from error
 
@@ -139,7 +137,8 @@ def naming_the_option() -> Iterator[None]:
 def _remove_unfinished(folder: Path) -> None:
     """Remove what a process that was killed while writing left behind."""
     _remove(sealing.partial(folder / name) for name in (*FILES, stored_demonstrations.FOLDER))
-    _remove((folder / cells.FOLDER).glob(sealing.partial(Path("*")).name))
+    for name in (cells.FOLDER, "figures"):
+        _remove((folder / name).glob(sealing.partial(Path("*")).name))
 
 
 def _remove(paths: Iterable[Path]) -> None:
