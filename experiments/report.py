@@ -12,8 +12,7 @@ import tyro
 from cmedirl_jax import envs
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.runs import statistics
-from cmedirl_jax.runs.console import screen, streams
-from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.console import ending, screen, streams
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import outputs, tables
@@ -32,20 +31,16 @@ class Options:
     folder: Annotated[Path, tyro.conf.Positional]
 
 
-@streams.flushed()
+@ending.in_a_line("report")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code, 1 if a figure could not be drawn."""
     options = tyro.cli(
         Options, prog="python -m experiments.report", description=__doc__, args=arguments
     )
     folder = options.folder
-    try:
-        run_folder.read(folder)
-        with run_folder.held(folder):
-            wrong = report(folder, redraw=True).wrong
-    except (UserError, OSError) as error:
-        streams.complain(f"report: {error}")
-        return 2 if isinstance(error, UserError) else 1
+    run_folder.read(folder)
+    with run_folder.held(folder):
+        wrong = report(folder, redraw=True).wrong
     screen.say(screen.console(), f"Tables and figures: {folder}")
     for line in wrong:
         streams.complain(f"report: {line}")

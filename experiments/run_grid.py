@@ -16,7 +16,7 @@ from cmedirl_jax.runs import run as run_lib
 from cmedirl_jax.runs import start, validation
 from cmedirl_jax.runs.cluster import processes
 from cmedirl_jax.runs.config import StudyConfig
-from cmedirl_jax.runs.console import compile_cache, screen, signals, streams
+from cmedirl_jax.runs.console import compile_cache, ending, screen, signals, streams
 from cmedirl_jax.runs.errors import Interrupted, UserError
 from cmedirl_jax.runs.storage import plain
 from experiments.presets import PRESETS
@@ -27,15 +27,12 @@ _OF_A_PROCESS = ("out", "coordinator", "process_id")
 """The options in which the processes of one run may differ."""
 
 
-@streams.flushed()
+@ending.in_a_line("run_grid")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     config = parse(arguments)
-    try:
-        processes.check(config.cluster)
-    except UserError as error:
-        return _end(2, str(error))
+    processes.check(config.cluster)
     if not config.cluster.several:
         return work(config)
     if not processes.is_worker():

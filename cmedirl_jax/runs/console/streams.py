@@ -3,7 +3,6 @@
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
 from typing import TextIO, cast
 
 
@@ -39,15 +38,6 @@ def complain(line: str) -> None:
     """Print a line on standard error, if that is still there."""
     if sys.stderr is not None:
         print(line, file=_dispensable(sys.stderr), flush=True)
-
-
-@contextlib.contextmanager
-def flushed() -> Iterator[None]:
-    """Flush both at the end of a command, whatever its end is."""
-    try:
-        yield
-    finally:
-        flush()
 
 
 def flush() -> None:
