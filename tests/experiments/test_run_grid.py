@@ -20,7 +20,7 @@ from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import tables
 from cmedirl_jax.training import evaluation
 from cmedirl_jax.training.methods import METHODS
-from experiments import report, run_grid
+from experiments import figures, report, run_grid
 from tests.support import ROOT, pools
 
 SMOKE = ("--preset", "smoke")
@@ -488,6 +488,32 @@ def test_figures_that_are_gone_are_drawn_again(smoke, main, tmp_path):
     assert main(*SMOKE, "--out", folder) == 0
     assert (folder / "figures" / "figure3.png").exists()
     assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
+
+
+def test_figures_that_cannot_be_drawn_are_lines_and_the_results_stand(
+    smoke, main, monkeypatch, tmp_path, capsys
+):
+    folder = shutil.copytree(smoke[0], tmp_path / "run")
+    (folder / "summary.csv").write_bytes(b"another")
+    with monkeypatch.context() as patch:
+        patch.setattr(figures, "average_return", lambda *_: 1 / 0)
+        assert main(*SMOKE, "--out", folder) == 0
+        output, errors = capsys.readouterr()
+        assert smoke[1].stdout.endswith(output.replace(str(folder), str(smoke[0])))
+        assert errors == (
+            "run_grid: figure3.png is not drawn (ZeroDivisionError: division by zero); "
+            "the results stand, and start the same command again to go on\n"
+        )
+        assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
+        # Those of another summary are gone.
+        assert not any((folder / "figures").iterdir())
+        assert report.main([str(folder)]) == 1
+        line = "report: figure3.png is not drawn (ZeroDivisionError: division by zero)\n"
+        assert capsys.readouterr().err == line
+    assert main(*SMOKE, "--out", folder) == 0
+    assert capsys.readouterr().err == ""
+    for path in (smoke[0] / "figures").iterdir():
+        assert (folder / "figures" / path.name).read_bytes() == path.read_bytes()
 
 
 def test_a_report_makes_tables_and_figures_again_without_training(smoke, tmp_path, capsys):
