@@ -32,16 +32,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     config = parse(arguments)
+    fewer_will_do = _read_first(arguments).n_demos is None
     processes.check(config.cluster)
     if not config.cluster.several:
-        return work(config)
+        return work(config, fewer_will_do)
     if not processes.is_worker():
         return processes.supervise("experiments.run_grid", arguments)
-    return processes.guarded("run_grid", lambda: work(config))
+    return processes.guarded("run_grid", lambda: work(config, fewer_will_do))
 
 
-def work(config: StudyConfig) -> int:
-    """Do the run, or this process's share of it; returns the exit code."""
+def work(config: StudyConfig, fewer_will_do: bool) -> int:
+    """Do the run, or this process's share of it; returns the exit code.
+
+    Args:
+        config: what the command line says.
+        fewer_will_do: whether it leaves the number of demonstrations to the file's.
+    """
     console = screen.console()
     compile_cache.use_cache()
     same = {k: v for k, v in plain.plain(config).items() if k not in _OF_A_PROCESS}
@@ -49,7 +55,10 @@ def work(config: StudyConfig) -> int:
         cluster, devices = start.start(config.cluster, config.devices, config.seeds, same)
         console.quiet = not cluster.writer
         with signals.noted(None if console.quiet else _STOPPING, cluster) as interruption:
-            plan = validation.plan(config, cluster)
+            plan = validation.plan(config, cluster, fewer_will_do=fewer_will_do)
+            if plan.subset_size < max(config.n_demos):
+                held = f"holds {plan.subset_size} demonstrations, and each learner has them all"
+                screen.say(console, f"{config.demos} {held}")
             # Matplotlib and scipy take a second to import: a refusal does not wait for them.
             from experiments import report
 
@@ -85,17 +94,22 @@ def _end(exit_code: int, line: str) -> int:
 
 def parse(arguments: Sequence[str]) -> StudyConfig:
     """The configuration: the preset's, with whatever else the command line says."""
-    # The preset decides every other default, so it is read first; tyro reports a wrong one.
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--preset", default="tuned")
-    preset, _ = first.parse_known_args(list(arguments))
     return tyro.cli(
         StudyConfig,
         prog="python -m experiments.run_grid",
         description=__doc__,
-        default=PRESETS.get(preset.preset, PRESETS["tuned"]),
+        default=PRESETS.get(_read_first(arguments).preset, PRESETS["tuned"]),
         args=list(arguments),
     )
+
+
+def _read_first(arguments: Sequence[str]) -> argparse.Namespace:
+    # The preset decides every other default, which tyro needs; it reports a wrong one.
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--preset", default="tuned")
+    # A default number of demonstrations is no more than a file holds; a number given is meant.
+    parser.add_argument("--n-demos", "--n_demos", nargs="*")
+    return parser.parse_known_args(list(arguments))[0]
 
 
 def summary_table(summary: pl.DataFrame) -> Table:

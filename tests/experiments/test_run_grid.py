@@ -12,14 +12,14 @@ from polars.testing import assert_frame_equal
 
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import checkpoint
-from cmedirl_jax.runs import load_policy, load_reward, start, train, validation
+from cmedirl_jax.runs import load_policy, load_reward, run, start, train, validation
 from cmedirl_jax.runs.cells import experts
 from cmedirl_jax.runs.cluster.base import ALONE
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import tables
 from cmedirl_jax.training import evaluation
-from cmedirl_jax.training.methods import METHODS
+from cmedirl_jax.training.methods import METHODS, PAPER_METHODS
 from experiments import figures, report, run_grid
 from tests.support import ROOT, pools
 
@@ -176,6 +176,31 @@ def demos(tmp_path):
 def test_more_demonstrations_than_the_file_holds_are_refused(refused, demos):
     line = refused("--demos", demos, "--n-demos", 1, 4)
     assert line == "--n-demos: 4 asked, the pool holds 3"
+
+
+def test_a_file_with_fewer_demonstrations_than_the_default_is_used_whole(
+    main, demos, monkeypatch, capsys
+):
+    plans = []
+
+    def stop(plan, *_):
+        plans.append(plan)
+        raise UserError("planned")
+
+    monkeypatch.setattr(run, "run", stop)
+    out = ("--out", "run")
+    assert main("--demos", demos, *out) == 2
+    assert capsys.readouterr() == (
+        f"{demos} holds 3 demonstrations, and each learner has them all\n",
+        "run_grid: planned\n",
+    )
+    # As if the number had been given.
+    assert main("--demos", demos, "--n-demos", 3, *out) == 2
+    whole, given = plans
+    assert whole.asked == given.asked == [("ddpg", 0), *((m, 3) for m in PAPER_METHODS[1:])]
+    assert (whole.config, whole.subset_size) == (given.config, 3)
+    assert main("--demos", demos, "--n_demos=4", *out) == 2
+    assert "--n-demos: 4 asked, the pool holds 3" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
