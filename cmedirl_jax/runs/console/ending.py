@@ -25,13 +25,12 @@ def in_a_line(
     def decorate(main: Callable[Parameters, int]) -> Callable[Parameters, int]:
         @functools.wraps(main)
         def ended(*args: Parameters.args, **kwargs: Parameters.kwargs) -> int:
-            try:
-                return main(*args, **kwargs)
-            except (UserError, OSError) as error:
-                streams.complain(f"{program}: {error}")
-                return 2 if isinstance(error, UserError) else 1
-            finally:
-                streams.flush()
+            with streams.unfailing():
+                try:
+                    return main(*args, **kwargs)
+                except (UserError, OSError) as error:
+                    streams.complain(f"{program}: {error}")
+                    return 2 if isinstance(error, UserError) else 1
 
         return ended
 

@@ -6,6 +6,7 @@ import pytest
 
 from cmedirl_jax.runs.console import ending
 from cmedirl_jax.runs.errors import UserError
+from experiments import report
 
 
 def command(error=None):
@@ -40,7 +41,16 @@ def test_output_that_nobody_reads_ends_nothing(monkeypatch):
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "w") as stream:
-        monkeypatch.setattr(sys, "stdout", stream)
-        assert command()("results") == 3
-        with pytest.raises(KeyError):
-            command(KeyError("a mistake of ours"))("results")
+        for output in (stream, None):
+            monkeypatch.setattr(sys, "stdout", output)
+            assert command()("results\n" * 10_000) == 3
+            with pytest.raises(KeyError):
+                command(KeyError("a mistake of ours"))("results")
+            assert sys.stdout is output
+
+
+def test_help_that_nobody_reads_is_no_failure(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    with pytest.raises(SystemExit) as end:
+        report.main(["--help"])
+    assert end.value.code == 0
