@@ -12,9 +12,12 @@ WIDE = 1_000
 def console() -> Console:
     """Standard output; what cannot be printed is left out."""
     stream = streams.dispensable()
-    if stream is not None and stream.isatty():
-        return Console(file=stream)
-    return Console(file=stream, width=WIDE, force_interactive=False)
+    if stream is None or not stream.isatty():
+        return Console(file=stream, width=WIDE, force_interactive=False)
+    console = Console(file=stream)
+    # Some terminals inherit COLUMNS=0, on which rich prints nothing.
+    console.width = console.width or 80
+    return console
 
 
 def show(console: Console, table: Table) -> None:

@@ -60,13 +60,14 @@ def test_a_pipe_is_as_wide_as_it_must_be_whatever_is_inherited(monkeypatch):
     assert sys.stdout.getvalue().count("\n") == 1
 
 
-def test_a_terminal_keeps_its_width(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "77")
+@pytest.mark.parametrize(("columns", "width"), [("77", 77), ("0", 80), ("many", 80)])
+def test_a_terminal_keeps_its_width(monkeypatch, columns, width):
+    monkeypatch.setenv("COLUMNS", columns)
     monkeypatch.setenv("TERM", "xterm")
     controller, terminal = os.openpty()
     with os.fdopen(terminal, "w") as stream:
         monkeypatch.setattr(sys, "stdout", stream)
         console = screen.console()
         assert console.is_interactive
-        assert console.width == 77
+        assert console.width == width
     os.close(controller)
