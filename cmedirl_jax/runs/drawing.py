@@ -5,8 +5,10 @@ import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-# Files need no backend. Notebooks hand theirs over, and an unknown one would end the import.
+# Files need no backend and no settings of the user's, and wrong ones would end the import: a
+# notebook hands its backend over to programs that lack it.
 os.environ.pop("MPLBACKEND", None)
+os.environ["MATPLOTLIBRC"] = os.devnull
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -14,7 +16,7 @@ from matplotlib.figure import Figure
 
 from cmedirl_jax.runs.storage import outputs
 
-# Matplotlib's classes are imported from here: after the line above.
+# Matplotlib's classes are imported from here, so that the environment is right before.
 __all__ = ["Axes", "Figure", "save"]
 
 

@@ -45,13 +45,17 @@ def test_what_cannot_be_drawn_or_written_is_a_line(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_the_backend_that_a_notebook_hands_over_does_not_matter(tmp_path):
-    backend = "module://not_installed_here.backend_inline"
+def test_neither_a_notebooks_backend_nor_a_broken_matplotlibrc_matters(tmp_path):
+    (tmp_path / "matplotlibrc").write_bytes(b"font.size: many\n\xff")
     script = (
         "from cmedirl_jax.runs import drawing; from pathlib import Path\n"
         f"assert drawing.save(drawing.Figure, [Path({str(tmp_path / 'one.png')!r})], print)"
     )
-    environment = {"MPLBACKEND": backend, "MPLCONFIGDIR": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, env=environment, check=False)
-    assert done.returncode == 0
+    environment = {
+        "MPLBACKEND": "module://not_installed_here.backend_inline",
+        "MPLCONFIGDIR": str(tmp_path),
+    }
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
     assert (tmp_path / "one.png").stat().st_size
