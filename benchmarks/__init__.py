@@ -1,1 +1,15 @@
-"""How fast cmedirl_jax is, and beside whom."""
+"""How fast it is, and beside whom: `python -m benchmarks.seeds_per_second`, and the others."""
+
+from experiments import check_command
+
+COMMANDS = (
+    "seeds_per_second",
+    "peers",
+    "profile",
+    "checkpoint_cost",
+    "soak",
+    "scaling",
+    "worker",
+)
+
+check_command("benchmarks", COMMANDS)

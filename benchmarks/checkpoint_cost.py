@@ -11,17 +11,17 @@ from typing import Any
 
 import jax
 import tyro
-from rich.console import Console
 
 from benchmarks import measuring, ours
+from cmedirl_jax.runs import start
 from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.config import StudyConfig
-from cmedirl_jax.runs.console import compile_cache
+from cmedirl_jax.runs.console import compile_cache, ending, screen, streams
 from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.storage import checkpoints
+from cmedirl_jax.runs.storage import checkpoints, outputs
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.training.settings import Settings
 
@@ -64,31 +64,27 @@ class _Timed(Checkpointer):
         self.saved += due
 
 
+@ending.in_a_line("checkpoint_cost")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; returns the exit code."""
     options = tyro.cli(
         Options, prog="python -m benchmarks.checkpoint_cost", description=__doc__, args=arguments
     )
+    outputs.check("json", options.json)
     compile_cache.use_cache()
     jax.config.update("jax_num_cpu_devices", max(1, measuring.cores()))
-    compiled = ours.compile_programs("ddpg", Settings(), jax.devices(), seeds_count=options.seeds)
-    try:
-        measured = measure(options, compiled)
-    except UserError as error:
-        print(f"checkpoint_cost: {error}", file=sys.stderr)
-        return 2
-    result = measuring.heading("checkpoint_cost") | measured
-    console = Console()
-    console.print(
+    compiled = ours.compile_programs("ddpg", Settings(), start.devices(), seeds_count=options.seeds)
+    result = measuring.heading("checkpoint_cost") | measure(options, compiled)
+    if options.json is not None:
+        measuring.write(result, options.json)
+    screen.say(
+        screen.console(),
         f"{result['checkpoint_bytes'] / 1e6:.0f} MB a checkpoint, {result['checkpoints']} of them: "
         f"training stood still for {result['blocked_seconds']:.3f} s each; one every "
         f"{options.every:g} s took {result['cost']:.1%} ({result['cost_low']:.1%} to "
         f"{result['cost_high']:.1%} over {options.rounds} rounds) of the time. At one every "
         f"{StudyConfig.checkpoint_every:g} s, the default: {result['cost_by_default']:.2%}.",
-        highlight=False,
     )
-    if options.json is not None:
-        measuring.write(result, options.json)
     return 0
 
 
@@ -108,7 +104,7 @@ def measure(options: Options, compiled: CompiledMethod) -> dict[str, Any]:
                 {},
                 every=options.every,
                 interruption=Interruption(),
-                say=lambda line: print(line, file=sys.stderr),
+                say=streams.complain,
             )
             without = train_seconds(options, compiled, None)
             ratios.append(train_seconds(options, compiled, checkpointer) / without)

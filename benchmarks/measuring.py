@@ -15,8 +15,8 @@ from typing import Any
 
 from benchmarks.serving import Worker
 from benchmarks.workload import CAPACITY, Workload
-from cmedirl_jax.io import atomic
 from cmedirl_jax.runs.start import cores
+from cmedirl_jax.runs.storage import outputs
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy")
 
@@ -159,9 +159,7 @@ def heading(program: str) -> dict[str, Any]:
 
 def write(result: dict[str, Any], path: Path) -> None:
     """Write a file of measurements; makes its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic.replacing(path) as partial:
-        partial.write_text(json.dumps(result, indent=1) + "\n")
+    outputs.write(path, (json.dumps(result, indent=1) + "\n").encode())
 
 
 def machine() -> dict[str, Any]:

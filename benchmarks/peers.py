@@ -26,6 +26,8 @@ from benchmarks import measuring
 from benchmarks.serving import Worker
 from benchmarks.workload import Workload
 from cmedirl_jax.io import atomic
+from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.storage import outputs
 
 STEPS = 500
 """Environment steps per learner and round."""
@@ -137,9 +139,11 @@ def versions(python: Path) -> dict[str, str]:
     return {package["name"]: package["version"] for package in json.loads(listed.stdout)}
 
 
+@ending.in_a_line("peers")
 def main(options: Options) -> int:
     """Install, measure, print and write; returns the exit code."""
-    console = Console(width=None if sys.stdout.isatty() else 140)
+    outputs.check("json", options.json)
+    console = screen.console()
     ours = Workload()
     entries: list[dict[str, Any]] = [
         peer._asdict() for peer in PEERS if peer.module in options.peers
@@ -156,9 +160,9 @@ def main(options: Options) -> int:
         "ours": {"seeds": ours.seeds, "learning_steps_per_second": statistics.median(our_rates)},
         "peers": entries,
     }
-    console.print(table(result))
     if options.json is not None:
         measuring.write(result, options.json)
+    screen.show(console, table(result))
     return 0
 
 

@@ -19,12 +19,13 @@ import jax
 import numpy as np
 import tyro
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from benchmarks.workload import CAPACITY
 from cmedirl_jax import envs, training
 from cmedirl_jax.networks import Architecture
+from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.start import devices
 from cmedirl_jax.training import seeds
 from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.settings import Settings
@@ -101,8 +102,10 @@ def self_times(events: list[tuple[str, float, float]]) -> list[tuple[str, float]
     return result
 
 
+@ending.in_a_line("profile")
 def main(options: Options) -> int:
     """Run a chunk under the profiler and print its table; returns the exit code."""
+    devices()
     program, state = compiled_chunk(options)
     run = functools.partial(_run, program, state)
     run()
@@ -120,7 +123,7 @@ def main(options: Options) -> int:
             spent[kind] += duration
             operations[kind] += 1
 
-    Console().print(table(options, seconds, spent, operations))
+    screen.show(screen.console(), table(options, seconds, spent, operations))
     return 0
 
 

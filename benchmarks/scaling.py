@@ -6,6 +6,7 @@ communication after every chunk is timed by itself.
 """
 
 import dataclasses
+import functools
 import json
 import socket
 import statistics
@@ -27,6 +28,8 @@ from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.runs.cluster.base import ALONE, Cluster
 from cmedirl_jax.runs.cluster.together import Together
+from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.storage import outputs
 from cmedirl_jax.training import seeds
 from cmedirl_jax.training.settings import Settings
 
@@ -57,6 +60,7 @@ class Options:
     json: Path | None = None
 
 
+@ending.in_a_line("scaling")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, or be one of the processes that are measured; returns the exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -66,14 +70,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = tyro.cli(
         Options, prog="python -m benchmarks.scaling", description=__doc__, args=arguments
     )
+    outputs.check("json", options.json)
     measured = measure(options.method, options.seeds, options.rounds)
     one, two = ([turn["chunk_s"] + turn["gather_s"] for turn in measured[name]] for name in PAIR)
     ratios = sorted(a / b for a, b in zip(one, two, strict=True))
     median = statistics.median(ratios)
-    print(f"Two processes have {median:.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f}) times the rate")
-    for name, turns in measured.items():
-        seconds = {key: f"{value:.4g}" for key, value in medians(turns).items()}
-        print(f"{name}: {seconds}")
     if options.json is not None:
         result = measuring.heading("scaling") | {
             "method": options.method,
@@ -83,6 +84,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "rounds": measured,
         }
         measuring.write(result, options.json)
+    say = functools.partial(screen.say, screen.console())
+    say(f"Two processes have {median:.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f}) times the rate")
+    for name, turns in measured.items():
+        seconds = {key: f"{value:.4g}" for key, value in medians(turns).items()}
+        say(f"{name}: {seconds}")
     return 0
 
 

@@ -14,12 +14,14 @@ from typing import Any, NamedTuple
 
 import tyro
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from benchmarks import measuring, plots
 from benchmarks.measuring import Comparison
 from benchmarks.workload import Workload
+from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import outputs
 from cmedirl_jax.training.methods import PAPER_METHODS
 
 SEEDS = (1, 8, 32, 100, 1000)
@@ -136,16 +138,15 @@ def compilation_times(methods: Sequence[str]) -> list[dict[str, Any]]:
     return times
 
 
+@ending.in_a_line("seeds_per_second")
 def main(options: Options) -> int:
     """Measure, print and write; returns the exit code."""
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    outputs.check("json", options.json)
+    console = screen.console()
     devices = options.devices or measuring.cores()
     rounds = options.rounds or (3 if options.quick else 5)
     everything = list(suites(devices, options.methods, options.quick))
-    refusal = _refusal(options, everything)
-    if refusal is not None:
-        print(f"seeds_per_second: {refusal}", file=sys.stderr)
-        return 2
+    _check(options, everything)
     result: dict[str, Any] = {
         **measuring.heading("seeds_per_second"),
         "records": [],
@@ -159,19 +160,19 @@ def main(options: Options) -> int:
         result["records"] += [{"suite": suite.name, **record.fields()} for record in records]
         for name, above, below in suite.ratios:
             ratio = measuring.compare(suite.name, name, records[above].rates, records[below].rates)
-            console.print(_line(ratio), highlight=False, soft_wrap=True)
+            screen.say(console, _line(ratio))
             result["comparisons"].append(dataclasses.asdict(ratio))
         # After each suite: the whole takes more than an hour, and an end in between keeps the rest.
         write(result, options.json)
     if "compilation" in (options.suites or ("compilation",)) and not options.quick:
         result["compilation"] = compilation_times(options.methods)
         write(result, options.json)
-    console.print(table(result["records"]))
+    screen.show(console, table(result["records"]))
     return 0
 
 
-def _refusal(options: Options, everything: Sequence[Suite]) -> str | None:
-    """What is wrong with the options, or None."""
+def _check(options: Options, everything: Sequence[Suite]) -> None:
+    """Refuse names that are unknown."""
     suite_names = list(dict.fromkeys([suite.name for suite in everything] + ["compilation"]))
     for option, asked, known in (
         ("suites", options.suites, suite_names),
@@ -180,8 +181,7 @@ def _refusal(options: Options, everything: Sequence[Suite]) -> str | None:
         for name in asked:
             if name not in known:
                 there = ", ".join(known)
-                return f"--{option}: unknown {option[:-1]} {name!r}; there are {there}"
-    return None
+                raise UserError(f"--{option}: unknown {option[:-1]} {name!r}; there are {there}")
 
 
 def write(result: dict[str, Any], path: Path | None) -> None:

@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 import tyro
-from rich.console import Console
 
 from benchmarks import measuring, plots
+from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.storage import outputs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,11 +44,13 @@ class Sample(NamedTuple):
     threads: int
 
 
+@ending.in_a_line("soak")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run and watch; returns the run's exit code."""
     options = tyro.cli(
         Options, prog="python -m benchmarks.soak", description=__doc__, args=arguments
     )
+    outputs.check("json", options.json)
     with tempfile.TemporaryDirectory() as folder:
         code, samples = watch(options, Path(folder) / "run")
     if code:
@@ -55,12 +58,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     growth = growth_per_cell(samples)
     most = max(sample.resident_bytes for sample in samples)
     middle, *_, last = least_per_cell(samples)[options.cells // 2 :]
-    Console().print(
-        f"{options.cells * options.seeds:,} seeds: {most / 2**20:.0f} MiB at most, "
-        f"{growth / 2**20:+.2f} MiB a cell once a quarter is done; "
-        f"{middle.open_files} open files half-way, {last.open_files} at the end",
-        highlight=False,
-    )
     if options.json is not None:
         result = measuring.heading("soak") | {
             "growth_bytes_per_cell": growth,
@@ -68,6 +65,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         }
         measuring.write(result, options.json)
         plots.soak(result["samples"], options.json.with_suffix(".png"))
+    screen.say(
+        screen.console(),
+        f"{options.cells * options.seeds:,} seeds: {most / 2**20:.0f} MiB at most, "
+        f"{growth / 2**20:+.2f} MiB a cell once a quarter is done; "
+        f"{middle.open_files} open files half-way, {last.open_files} at the end",
+    )
     return 0
 
 

@@ -17,16 +17,15 @@ import polars as pl
 import scipy.stats
 import tyro
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from cmedirl_jax import envs
-from cmedirl_jax.io import atomic
 from cmedirl_jax.runs import statistics
+from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.statistics import SeedStatistics
 from cmedirl_jax.runs.storage import folder as run_folder
-from cmedirl_jax.runs.storage import tables
+from cmedirl_jax.runs.storage import outputs, tables
 
 MEASURES: dict[str, Callable[[SeedStatistics, int], np.ndarray]] = {
     "convergence_env_step": lambda seeds, most: np.minimum(seeds.convergence_env_step, most),
@@ -54,20 +53,17 @@ class Options:
     out: Path | None = None
 
 
+@ending.in_a_line("compare")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = tyro.cli(
         Options, prog="python -m experiments.compare", description=__doc__, args=arguments
     )
-    try:
-        table = compare(options.folder, options.against)
-    except UserError as error:
-        print(f"compare: {error}", file=sys.stderr)
-        return 2
+    outputs.check("out", options.out)
+    table = compare(options.folder, options.against)
+    screen.show(screen.console(), shown(table, options.against))
     if options.out is not None:
-        with atomic.replacing(options.out) as partial:
-            table.write_csv(partial)
-    Console(width=None if sys.stdout.isatty() else 120).print(shown(table, options.against))
+        outputs.write(options.out, table.write_csv().encode())
     return 0
 
 

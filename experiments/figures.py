@@ -1,21 +1,16 @@
 """The paper's Figures 3, 4 and 5, drawn from the tables of a run."""
 
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import polars as pl
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from cmedirl_jax.io import atomic
-from cmedirl_jax.runs import statistics
+from cmedirl_jax.runs import drawing, statistics
+from cmedirl_jax.runs.console import streams
+from cmedirl_jax.runs.drawing import Axes, Figure
 from cmedirl_jax.training.methods import METHODS
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
@@ -29,39 +24,51 @@ def draw(
     summary: pl.DataFrame,
     expert_return: float | None,
     threshold: float,
+    say: Callable[[str], None] = streams.complain,
 ) -> list[Path]:
-    """Draw what the run's cells allow into `folder`, as PNG and SVG; returns the files."""
-    folder.mkdir(exist_ok=True)
-    n_demos = max(evaluations["n_demos"])
+    """Draw what the run's cells allow into `folder`, as PNG and SVG.
+
+    Args:
+        folder: made if it is missing.
+        evaluations: the run's table.
+        episodes: the run's table.
+        summary: a row for each cell.
+        expert_return: mean return of the demonstrations; None without any.
+        threshold: return that counts as solved.
+        say: called with a line for each figure that cannot be drawn; the others are drawn.
+
+    Returns:
+        The files that were written.
+    """
+    largest = pl.col("n_demos").is_in([0, max(evaluations["n_demos"])])
     figures = {
-        "figure3": average_return(
-            evaluations.filter(pl.col("n_demos").is_in([0, n_demos])),
-            episodes.filter(pl.col("n_demos").is_in([0, n_demos])),
-            expert_return,
-            threshold,
-        )
+        "figure3": lambda: average_return(
+            evaluations.filter(largest), episodes.filter(largest), expert_return, threshold
+        ),
+        "figure4": lambda: convergence(summary),
+        "figure5": lambda: return_after_convergence(summary, expert_return),
     }
-    if summary.filter(pl.col("n_demos") > 0)["n_demos"].n_unique() > 1:
-        figures["figure4"] = convergence(summary)
-        figures["figure5"] = return_after_convergence(summary, expert_return)
     paths = []
-    for name, figure in figures.items():
-        for suffix in ("png", "svg"):
-            path = folder / f"{name}.{suffix}"
-            # No date and no random ids: drawing the same tables again gives the same file.
-            metadata = {"Date": None} if suffix == "svg" else {"Software": None}
-            with plt.rc_context({"svg.hashsalt": name}), atomic.replacing(path) as partial:
-                figure.savefig(partial, format=suffix, dpi=150, metadata=metadata)
-            paths.append(path)
-        plt.close(figure)
+    for name, of_figure in files(folder, summary).items():
+        if drawing.save(figures[name], of_figure, say):
+            paths += of_figure
     return paths
+
+
+def files(folder: Path, summary: pl.DataFrame) -> dict[str, list[Path]]:
+    """The files of each figure that the cells of `summary` allow."""
+    names = ["figure3"]
+    if summary.filter(pl.col("n_demos") > 0)["n_demos"].n_unique() > 1:
+        names += ["figure4", "figure5"]
+    return {name: [folder / f"{name}.png", folder / f"{name}.svg"] for name in names}
 
 
 def average_return(
     evaluations: pl.DataFrame, episodes: pl.DataFrame, expert: float | None, threshold: float
 ) -> Figure:
     """Figure 3: noise-free return over environment steps; behaviour return over episodes."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained", sharey=True)
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
     for method, line in _lines(evaluations).items():
         rows = evaluations.filter((pl.col("method") == method) & (pl.col("protocol") == "steps"))
         _band(left, rows, "env_step", "return_mean", method, line)
@@ -101,7 +108,8 @@ def average_return(
 
 def convergence(summary: pl.DataFrame) -> Figure:
     """Figure 4: episodes and environment steps until convergence, over N_T."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
     _over_demonstrations(left, summary, "convergence_episode_median")
     left.set(ylabel="median episodes")
     _over_demonstrations(right, summary, "convergence_env_step_median")
@@ -115,7 +123,8 @@ def convergence(summary: pl.DataFrame) -> Figure:
 
 def return_after_convergence(summary: pl.DataFrame, expert: float | None) -> Figure:
     """Figure 5: mean return from convergence to the end of the run, over N_T."""
-    figure, axes = plt.subplots(figsize=(5.5, 4), layout="constrained")
+    figure = Figure(figsize=(5.5, 4), layout="constrained")
+    axes = figure.subplots()
     _over_demonstrations(axes, summary, "return_after_convergence")
     if expert is not None:
         axes.axhline(expert, color="0.4", linestyle="--", linewidth=1, label="demonstrations")

@@ -17,14 +17,15 @@ import numpy as np
 import polars as pl
 import tyro
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from cmedirl_jax import envs, ranges
 from cmedirl_jax.envs import Env
-from cmedirl_jax.io import atomic
 from cmedirl_jax.ranges import AtLeastTwo, BelowOne, Size
-from cmedirl_jax.runs.console import compile_cache
+from cmedirl_jax.runs import start
+from cmedirl_jax.runs.console import compile_cache, ending, screen
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import outputs
 from cmedirl_jax.tabular import discretise, interpolation
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.tabular.optimal_control import value_iteration
@@ -51,30 +52,35 @@ class Options:
     out: Path | None = None
 
 
+@ending.in_a_line("optimal_return")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = tyro.cli(Options, prog="python -m experiments.optimal_return", args=arguments)
     compile_cache.use_cache()
+    outputs.check("out", options.out)
+    start.devices()
     try:
         table = optimal_returns(options)
     except ValueError as error:
-        print(f"optimal_return: {error}", file=sys.stderr)
-        return 2
-    console = Console(width=None if sys.stdout.isatty() else 100)
-    shown = Table(title=f"means over {options.starts} start states", box=box.SIMPLE)
+        raise UserError(str(error)) from error
+    console = screen.console()
+    screen.show(console, means(table, options.starts))
+    if options.out is not None:
+        outputs.write(options.out, table.write_csv().encode())
+        screen.say(console, f"Table: {options.out}")
+    return 0
+
+
+def means(table: pl.DataFrame, starts: int) -> Table:
+    """The means over the start states as a table for the screen."""
+    shown = Table(title=f"means over {starts} start states", box=box.SIMPLE)
     names = ("states", "discount", "value", "attained", "attained_return")
     for name in names:
         shown.add_column(name.replace("_", " "), justify="right")
-    means = table.group_by("states", "discount", maintain_order=True).mean()
-    for row in means.select(names).iter_rows():
+    rows = table.group_by("states", "discount", maintain_order=True).mean()
+    for row in rows.select(names).iter_rows():
         shown.add_row(*(f"{value:.6g}" for value in row))
-    console.print(shown)
-    if options.out is not None:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        with atomic.replacing(options.out) as partial:
-            table.write_csv(partial)
-        console.print(f"Table: {options.out}", highlight=False, soft_wrap=True)
-    return 0
+    return shown
 
 
 def optimal_returns(options: Options) -> pl.DataFrame:

@@ -4,7 +4,7 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import polars as pl
 import tyro
@@ -12,10 +12,10 @@ import tyro
 from cmedirl_jax import envs
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.runs import statistics
-from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.console import ending, screen, streams
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.runs.storage import folder as run_folder
-from cmedirl_jax.runs.storage import tables
+from cmedirl_jax.runs.storage import outputs, tables
 from cmedirl_jax.training.methods import METHODS
 from experiments import figures
 
@@ -31,31 +31,39 @@ class Options:
     folder: Annotated[Path, tyro.conf.Positional]
 
 
+@ending.in_a_line("report")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
+    """Run the command; returns its exit code, 1 if a figure could not be drawn."""
     options = tyro.cli(
         Options, prog="python -m experiments.report", description=__doc__, args=arguments
     )
     folder = options.folder
-    try:
-        run_folder.read(folder)
-        with run_folder.held(folder):
-            report(folder, redraw=True)
-    except (UserError, OSError) as error:
-        print(f"report: {error}", file=sys.stderr)
-        return 2 if isinstance(error, UserError) else 1
-    print(f"Tables and figures: {folder}")
-    return 0
+    run_folder.read(folder)
+    with run_folder.held(folder):
+        wrong = report(folder, redraw=True).wrong
+    screen.say(screen.console(), f"Tables and figures: {folder}")
+    for line in wrong:
+        streams.complain(f"report: {line}")
+    return 1 if wrong else 0
 
 
-def report(folder: Path, redraw: bool = False) -> pl.DataFrame:
-    """Write the tables, summary and figures of the cells that config.json asks for.
+class Report(NamedTuple):
+    """What became of a report.
 
-    A file that would be as it is stays untouched; the figures are drawn again if the summary has
-    changed, they are gone, or `redraw` says so.
+    Attributes:
+        summary: a row for each cell.
+        wrong: a line for each figure that could not be drawn.
+    """
 
-    Returns:
-        The summary.
+    summary: pl.DataFrame
+    wrong: list[str]
+
+
+def report(folder: Path, redraw: bool = False) -> Report:
+    """Write the tables, the summary and the figures of the cells that config.json asks for.
+
+    A file that would be as it is stays untouched; a figure is drawn if the summary has changed, it
+    is gone, or `redraw` says so.
 
     Raises:
         UserError: if the folder holds no finished cell of a run, or a damaged one.
@@ -66,13 +74,16 @@ def report(folder: Path, redraw: bool = False) -> pl.DataFrame:
     threshold = envs.make(config["env"]).spec.reward_threshold
     summary = summarise(run_tables, threshold, config["max_episodes"])
     tables.write(folder, run_tables)
-    # The summary is written last, so that a run cut off among its figures draws them again.
+    # Figures of another summary go before this one comes: those that are there belong to it.
     path, content = folder / "summary.csv", summary.write_csv().encode()
-    same = path.is_file() and path.read_bytes() == content
-    if redraw or not same or not (folder / "figures").exists():
-        _draw(folder, run_tables, summary, threshold)
-    tables.write_if_other(path, content)
-    return summary
+    if not path.is_file() or path.read_bytes() != content:
+        for figure in (folder / "figures").glob("figure*"):
+            figure.unlink()
+    outputs.write(path, content)
+    files = figures.files(folder / "figures", summary).values()
+    if not redraw and all(file.exists() for of_figure in files for file in of_figure):
+        return Report(summary, [])
+    return Report(summary, _draw(folder, run_tables, summary, threshold))
 
 
 def summarise(
@@ -103,9 +114,10 @@ def _draw(
     run_tables: dict[str, pl.DataFrame],
     summary: pl.DataFrame,
     threshold: float,
-) -> None:
+) -> list[str]:
     pool = stored_demonstrations.load(folder)
     expert = None if pool is None else float(demonstrations.returns(pool).mean())
+    wrong = []
     figures.draw(
         folder / "figures",
         run_tables["evaluations"],
@@ -113,7 +125,9 @@ def _draw(
         summary,
         expert,
         threshold,
+        wrong.append,
     )
+    return wrong
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from cmedirl_jax.runs import run as run_lib
 from cmedirl_jax.runs import start, validation
 from cmedirl_jax.runs.cluster import processes
 from cmedirl_jax.runs.config import StudyConfig
-from cmedirl_jax.runs.console import compile_cache, signals, streams
+from cmedirl_jax.runs.console import compile_cache, ending, screen, signals, streams
 from cmedirl_jax.runs.errors import Interrupted, UserError
 from cmedirl_jax.runs.storage import plain
 from experiments.presets import PRESETS
@@ -27,40 +27,42 @@ _OF_A_PROCESS = ("out", "coordinator", "process_id")
 """The options in which the processes of one run may differ."""
 
 
+@ending.in_a_line("run_grid")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    try:
-        return _main(sys.argv[1:] if arguments is None else arguments)
-    finally:
-        streams.flush()
-
-
-def _main(arguments: Sequence[str]) -> int:
+    arguments = sys.argv[1:] if arguments is None else arguments
     config = parse(arguments)
-    try:
-        processes.check(config.cluster)
-    except UserError as error:
-        return _end(2, str(error))
+    fewer_will_do = _read_first(arguments).n_demos is None
+    processes.check(config.cluster)
     if not config.cluster.several:
-        return work(config)
+        return work(config, fewer_will_do)
     if not processes.is_worker():
         return processes.supervise("experiments.run_grid", arguments)
-    return processes.guarded("run_grid", lambda: work(config))
+    return processes.guarded("run_grid", lambda: work(config, fewer_will_do))
 
 
-def work(config: StudyConfig) -> int:
-    """Do the run, or this process's share of it; returns the exit code."""
-    console = Console(file=streams.dispensable())
-    if not console.is_terminal:
-        console = Console(file=streams.dispensable(), width=120)
+def work(config: StudyConfig, fewer_will_do: bool) -> int:
+    """Do the run, or this process's share of it; returns the exit code.
+
+    Args:
+        config: what the command line says.
+        fewer_will_do: whether it leaves the number of demonstrations to the file's.
+    """
+    console = screen.console()
     compile_cache.use_cache()
     same = {k: v for k, v in plain.plain(config).items() if k not in _OF_A_PROCESS}
     try:
         cluster, devices = start.start(config.cluster, config.devices, config.seeds, same)
         console.quiet = not cluster.writer
         with signals.noted(None if console.quiet else _STOPPING, cluster) as interruption:
-            plan = validation.plan(config, cluster)
-            summary = run_lib.run(plan, devices, console, interruption, _conclude, cluster)
+            plan = validation.plan(config, cluster, fewer_will_do=fewer_will_do)
+            if plan.subset_size < max(config.n_demos):
+                held = f"holds {plan.subset_size} demonstrations, and each learner has them all"
+                screen.say(console, f"{config.demos} {held}")
+            # Matplotlib and scipy take a second to import: a refusal does not wait for them.
+            from experiments import report
+
+            concluded = run_lib.run(plan, devices, console, interruption, report.report, cluster)
     except UserError as error:
         return _end(2, str(error))
     except Interrupted as error:
@@ -69,25 +71,20 @@ def work(config: StudyConfig) -> int:
         return _end(130, f"stopped at once; {_CONTINUE}")
     except OSError as error:
         return _end(1, f"{error}; what is finished is kept: {_CONTINUE}")
-    if summary is not None:
-        _print(console, summary, plan.folder)
+    if concluded is not None:
+        _print(console, concluded.summary, plan.folder)
+        for line in concluded.wrong:
+            streams.complain(f"run_grid: {line}; the results stand, and {_CONTINUE}")
     return 0
 
 
 def _print(console: Console, summary: pl.DataFrame, folder: Path) -> None:
-    console.print(summary_table(summary))
+    screen.show(console, summary_table(summary))
     difference = summary["gymnasium_difference_max"].max()
     console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
     if summary["diverged"].sum():
         console.print(f"Seeds that diverged and were stopped: {summary['diverged'].sum()}")
-    console.print(f"Tables and figures: {folder}", markup=False, highlight=False, soft_wrap=True)
-
-
-def _conclude(folder: Path) -> pl.DataFrame:
-    # Matplotlib and scipy take a second to import: a refusal does not wait for them.
-    from experiments import report
-
-    return report.report(folder)
+    screen.say(console, f"Tables and figures: {folder}")
 
 
 def _end(exit_code: int, line: str) -> int:
@@ -97,17 +94,22 @@ def _end(exit_code: int, line: str) -> int:
 
 def parse(arguments: Sequence[str]) -> StudyConfig:
     """The configuration: the preset's, with whatever else the command line says."""
-    # The preset decides every other default, so it is read first; tyro reports a wrong one.
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--preset", default="tuned")
-    preset, _ = first.parse_known_args(list(arguments))
     return tyro.cli(
         StudyConfig,
         prog="python -m experiments.run_grid",
         description=__doc__,
-        default=PRESETS.get(preset.preset, PRESETS["tuned"]),
+        default=PRESETS.get(_read_first(arguments).preset, PRESETS["tuned"]),
         args=list(arguments),
     )
+
+
+def _read_first(arguments: Sequence[str]) -> argparse.Namespace:
+    # The preset decides every other default, which tyro needs; it reports a wrong one.
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--preset", default="tuned")
+    # A default number of demonstrations is no more than a file holds; a number given is meant.
+    parser.add_argument("--n-demos", "--n_demos", nargs="*")
+    return parser.parse_known_args(list(arguments))[0]
 
 
 def summary_table(summary: pl.DataFrame) -> Table:

@@ -19,8 +19,8 @@ def name(call):
 
 
 def writes(call):
-    """Whether a call writes a file; one into a buffer in memory does not."""
-    if name(call) == "open":
+    """Whether a call writes a file: none is a buffer in memory, or what keeps nothing."""
+    if name(call) == "open" and "devnull" not in ast.dump(call):
         modes = [argument.value for argument in call.args if isinstance(argument, ast.Constant)]
         return any(str(mode)[:1] in ("w", "a", "x") for mode in modes)
     return name(call) in WRITES and call.args and getattr(call.args[0], "id", "") != "buffer"

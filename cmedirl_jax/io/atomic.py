@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,6 +33,17 @@ def replace(written: Path, path: Path) -> None:
     flush(written)
     os.replace(written, path)
     flush_name(path)
+
+
+def check_writable(folder: Path) -> None:
+    """Check that files can be written in a folder, which may not be there yet; leaves none.
+
+    Raises:
+        OSError: if they cannot.
+    """
+    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    with tempfile.TemporaryFile(dir=nearest):
+        pass
 
 
 def flush(path: Path) -> None:

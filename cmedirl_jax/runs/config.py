@@ -39,7 +39,8 @@ class StudyConfig:
         preset: tuned: the setting that works; paper: the paper's letter; smoke: ends within a
             minute.
         methods: Which methods to train.
-        n_demos: Demonstrated trajectories N_T per learner; several make Figures 4 and 5.
+        n_demos: Demonstrated trajectories N_T per learner; several make Figures 4 and 5. By
+            default also all that the file of --demos holds, where it holds fewer.
         seeds: Independent learners per cell.
         seed: Seed of the whole study.
         max_steps: Environment steps per learner.

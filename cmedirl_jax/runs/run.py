@@ -5,10 +5,9 @@ import errno
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
-import polars as pl
 from rich.console import Console
 
 from cmedirl_jax.runs import train
@@ -22,15 +21,17 @@ from cmedirl_jax.runs.train import Cell
 from cmedirl_jax.runs.validation import Plan
 from cmedirl_jax.training.methods import METHODS
 
+Concluded = TypeVar("Concluded")
+
 
 def run(
     plan: Plan,
     devices: Sequence[Any],
     console: Console,
     interruption: Interruption,
-    conclude: Callable[[Path], pl.DataFrame],
+    conclude: Callable[[Path], Concluded],
     cluster: Cluster = ALONE,
-) -> pl.DataFrame | None:
+) -> Concluded | None:
     """Train the cells that are missing, then conclude.
 
     Args:

@@ -33,7 +33,8 @@ def start(
         The processes, and the devices of all of them.
 
     Raises:
-        UserError: if more devices are asked for than there are, or the processes do not agree.
+        UserError: if more devices are asked for than there are, JAX's platform is not here, or the
+            processes do not agree.
     """
     share_heap(arenas=cores())
     # A device wants a few seeds to itself: fewer than four a device do not fill a vector unit.
@@ -43,7 +44,7 @@ def start(
         with contextlib.suppress(RuntimeError):
             jax.config.update("jax_num_cpu_devices", wanted)
     cluster = processes.join(options)
-    local = jax.local_devices()
+    local = devices()
     available = len(local) if local[0].platform != "cpu" else cores()
     refused = count is not None and count > available
     # All processes refuse together: one that left alone would keep the others waiting.
@@ -52,6 +53,24 @@ def start(
         raise UserError(f"--devices: {count} asked, {there}")
     cluster.check_same(same)
     return cluster, cluster.devices(None if count is None else max(count, 1), seeds)
+
+
+def devices() -> list[Any]:
+    """This process's devices; starts JAX.
+
+    Raises:
+        UserError: if the platform that JAX_PLATFORMS asks for is not here.
+    """
+    try:
+        return jax.local_devices()
+    # JAX asserts that it found a platform where it knows the name and lacks the plugin.
+    except (RuntimeError, AssertionError) as error:
+        asked = jax.config.jax_platforms  # pyright: ignore[reportAttributeAccessIssue]
+        reason = " ".join(str(error).split()) or "it is not installed, or has no device"
+        raise UserError(
+            f"JAX_PLATFORMS={asked or ''}: JAX finds no such platform here ({reason}); "
+            "give another, or cpu"
+        ) from error
 
 
 def cores() -> int:

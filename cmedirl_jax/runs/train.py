@@ -19,6 +19,7 @@ from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.evaluator import Evaluator
 from cmedirl_jax.runs.cluster.base import Cluster
+from cmedirl_jax.runs.console import screen
 from cmedirl_jax.runs.console.progress import Reporter, reporter
 from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.storage import cells, checkpoints, plain, tables
@@ -90,13 +91,12 @@ class Session(NamedTuple):
 
     def checkpointer(self, name: str) -> Checkpointer:
         """Saves the training that is called `name`."""
-        say = functools.partial(self.console.print, markup=False, highlight=False, soft_wrap=True)
         return Checkpointer(
             self.plan.folder / checkpoints.FOLDER / name,
             {"cell": name, **run_folder.identity(self.plan.config)},
             every=self.plan.checkpoint_every,
             interruption=self.interruption,
-            say=say,
+            say=functools.partial(screen.say, self.console),
             cluster=self.cluster,
         )
 

@@ -1,5 +1,6 @@
 """From a configuration to a plan: everything that can be refused is refused before any work."""
 
+import dataclasses
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -71,33 +72,36 @@ class Plan(NamedTuple):
         Raises:
             UserError: saying how many there are.
         """
-        _check_enough(self.asked, int(pool.episode[-1]) + 1)
+        _check_enough(self.asked, _held(pool))
 
 
-def plan(config: StudyConfig, cluster: Cluster = ALONE) -> Plan:
+def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool = False) -> Plan:
     """Check a configuration and work it out; reads the demonstrations that it names.
 
     Args:
         config: what the user asks for.
         cluster: the processes that share the run; process 0 alone reads files.
+        fewer_will_do: `n_demos` is a default; a file that holds fewer demonstrations is used whole.
 
     Raises:
         UserError: naming the option, what is wrong and what would be right.
     """
     check(config)
     env = envs.make(config.env)
-    asked = cells.asked(config.methods, config.n_demos)
     path, demos = config.demos, None
     if path is not None:
-        demos = cluster.pool_from_writer(
-            lambda: load_demonstrations(path, env, asked, config.check_demos)
-        )
+        demos = cluster.pool_from_writer(lambda: load_demonstrations(path, env, config.check_demos))
+        assert demos is not None
+        held = _held(demos)
+        if fewer_will_do and held < max(config.n_demos):
+            config = dataclasses.replace(config, n_demos=(held,))
+        _check_enough(cells.asked(config.methods, config.n_demos), held)
     return Plan(
         folder=config.folder,
         config=cluster.from_writer(lambda: describe(config)),
         env=env,
         study=config.seed,
-        asked=asked,
+        asked=cells.asked(config.methods, config.n_demos),
         seeds=config.seeds,
         budget=budget_of(config, env),
         settings=config.settings,
@@ -207,19 +211,16 @@ def _check_epsilon(settings: ExplorationSettings) -> None:
         raise UserError(f"--exploration.hot-start-factor: makes epsilon {largest:g}, above 1")
 
 
-def load_demonstrations(
-    path: Path, env: Env, asked: Sequence[tuple[str, int]], check: DemosCheck
-) -> Demonstrations:
+def load_demonstrations(path: Path, env: Env, check: DemosCheck) -> Demonstrations:
     """Read the file that `--demos` names.
 
     Args:
         path: the file.
         env: the task.
-        asked: method and number of demonstrations of each cell.
         check: what is asked of the demonstrations, see `StudyConfig`.
 
     Raises:
-        UserError: if it is missing, damaged, foreign, or holds too few.
+        UserError: if it is missing, damaged or foreign.
     """
     try:
         pool = demonstrations.load(path)
@@ -250,8 +251,11 @@ def load_demonstrations(
     steps = pool.metadata.get("expert_env_steps", 0)
     if type(steps) is not int or not 0 <= steps < 2**63:
         raise UserError(f"--demos: {path}: expert_env_steps in its metadata is {steps!r}, no count")
-    _check_enough(asked, int(pool.episode[-1]) + 1)
     return pool
+
+
+def _held(pool: Demonstrations) -> int:
+    return int(pool.episode[-1]) + 1
 
 
 def _check_enough(asked: Sequence[tuple[str, int]], held: int) -> None:

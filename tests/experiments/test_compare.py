@@ -146,7 +146,7 @@ def test_holm_rejects_no_less_than_bonferroni_and_no_more_than_single_tests():
 
 
 def test_the_command_prints_and_writes_the_table(folder, tmp_path, capsys):
-    out = tmp_path / "differences.csv"
+    out = tmp_path / "new" / "differences.csv"
     assert compare.main([str(folder), "--against", "ddpg", "--out", str(out)]) == 0
     assert "mean paired difference to ddpg" in capsys.readouterr().out
     assert pl.read_csv(out).height == 2 * 3
@@ -158,6 +158,7 @@ def test_the_command_prints_and_writes_the_table(folder, tmp_path, capsys):
         (["nowhere"], "nowhere: holds no run"),
         (["{folder}", "--against", "gail"], "holds no 'gail'; its methods are ddpg, hs-ddpg, me-"),
         (["{folder}", "--against", "bc"], "holds no 'bc'"),
+        (["{folder}", "--out", "{folder}"], "compare: --out: cannot write to "),
     ],
 )
 def test_mistakes_are_refused_in_a_line(folder, arguments, named, capsys):

@@ -12,15 +12,15 @@ from polars.testing import assert_frame_equal
 
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.io import checkpoint
-from cmedirl_jax.runs import load_policy, load_reward, start, train, validation
+from cmedirl_jax.runs import load_policy, load_reward, run, start, train, validation
 from cmedirl_jax.runs.cells import experts
 from cmedirl_jax.runs.cluster.base import ALONE
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import tables
 from cmedirl_jax.training import evaluation
-from cmedirl_jax.training.methods import METHODS
-from experiments import report, run_grid
+from cmedirl_jax.training.methods import METHODS, PAPER_METHODS
+from experiments import figures, report, run_grid
 from tests.support import ROOT, pools
 
 SMOKE = ("--preset", "smoke")
@@ -186,6 +186,31 @@ def demos(tmp_path):
 def test_more_demonstrations_than_the_file_holds_are_refused(refused, demos):
     line = refused("--demos", demos, "--n-demos", 1, 4)
     assert line == "--n-demos: 4 asked, the pool holds 3"
+
+
+def test_a_file_with_fewer_demonstrations_than_the_default_is_used_whole(
+    main, demos, monkeypatch, capsys
+):
+    plans = []
+
+    def stop(plan, *_):
+        plans.append(plan)
+        raise UserError("planned")
+
+    monkeypatch.setattr(run, "run", stop)
+    out = ("--out", "run")
+    assert main("--demos", demos, *out) == 2
+    assert capsys.readouterr() == (
+        f"{demos} holds 3 demonstrations, and each learner has them all\n",
+        "run_grid: planned\n",
+    )
+    # As if the number had been given.
+    assert main("--demos", demos, "--n-demos", 3, *out) == 2
+    whole, given = plans
+    assert whole.asked == given.asked == [("ddpg", 0), *((m, 3) for m in PAPER_METHODS[1:])]
+    assert (whole.config, whole.subset_size) == (given.config, 3)
+    assert main("--demos", demos, "--n_demos=4", *out) == 2
+    assert "--n-demos: 4 asked, the pool holds 3" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -491,6 +516,32 @@ def test_figures_that_are_gone_are_drawn_again(smoke, main, tmp_path):
     assert main(*SMOKE, "--out", folder) == 0
     assert (folder / "figures" / "figure3.png").exists()
     assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
+
+
+def test_figures_that_cannot_be_drawn_are_lines_and_the_results_stand(
+    smoke, main, monkeypatch, tmp_path, capsys
+):
+    folder = shutil.copytree(smoke[0], tmp_path / "run")
+    (folder / "summary.csv").write_bytes(b"another")
+    with monkeypatch.context() as patch:
+        patch.setattr(figures, "average_return", lambda *_: 1 / 0)
+        assert main(*SMOKE, "--out", folder) == 0
+        output, errors = capsys.readouterr()
+        assert smoke[1].stdout.endswith(output.replace(str(folder), str(smoke[0])))
+        assert errors == (
+            "run_grid: figure3.png is not drawn (ZeroDivisionError: division by zero); "
+            "the results stand, and start the same command again to go on\n"
+        )
+        assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
+        # Those of another summary are gone.
+        assert not any((folder / "figures").iterdir())
+        assert report.main([str(folder)]) == 1
+        line = "report: figure3.png is not drawn (ZeroDivisionError: division by zero)\n"
+        assert capsys.readouterr().err == line
+    assert main(*SMOKE, "--out", folder) == 0
+    assert capsys.readouterr().err == ""
+    for path in (smoke[0] / "figures").iterdir():
+        assert (folder / "figures" / path.name).read_bytes() == path.read_bytes()
 
 
 def test_a_report_makes_tables_and_figures_again_without_training(smoke, tmp_path, capsys):

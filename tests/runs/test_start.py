@@ -6,11 +6,15 @@ import sys
 import pytest
 
 from cmedirl_jax.runs import start
+from cmedirl_jax.runs.cluster.base import ClusterOptions
+from cmedirl_jax.runs.errors import UserError
 
 # Eight threads that allocate at the same time, each from the arena that it was given.
 SCRIPT = """
 import ctypes, re, sys, tempfile, threading
 from cmedirl_jax.runs import start
+from cmedirl_jax.runs.cluster.base import ClusterOptions
+from cmedirl_jax.runs.errors import UserError
 
 if sys.argv[1:]:
     start.share_heap(arenas=int(sys.argv[1]))
@@ -67,3 +71,23 @@ def test_another_c_library_is_left_alone(system, monkeypatch):
     monkeypatch.setattr(start.sys, "platform", system)
     monkeypatch.setattr(start.ctypes, "CDLL", lambda _: object())
     start.share_heap(arenas=2)
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (AssertionError(), "it is not installed, or has no device"),
+        (RuntimeError("Unable to initialize\nbackend 'cuda'"), "Unable to initialize backend "),
+    ],
+)
+def test_a_platform_that_is_not_here_is_refused(monkeypatch, error, reason):
+    def local_devices():
+        raise error
+
+    monkeypatch.setattr(start.jax, "local_devices", local_devices)
+    with pytest.raises(UserError) as refusal:
+        start.start(ClusterOptions(), None, 1, {})
+    line = str(refusal.value)
+    assert line.startswith("JAX_PLATFORMS=")
+    assert f": JAX finds no such platform here ({reason}" in line
+    assert "\n" not in line

@@ -12,6 +12,8 @@ from pathlib import Path
 import jax
 import platformdirs
 
+from cmedirl_jax.io import atomic
+
 _DURATIONS = (
     "/jax/core/compile/jaxpr_trace_duration",
     "/jax/core/compile/jaxpr_to_mlir_module_duration",
@@ -63,12 +65,19 @@ def counted() -> Iterator[Cost]:
 def use_cache() -> None:
     """Keep compiled programs in the user's cache folder, unless JAX was told where to keep them.
 
+    Where the user has no home, or none that can be written, they are compiled at every start.
+
     JAX writes entries in place. One that a kill or a full disk cut short is removed here: JAX would
     warn of it, and compile its program again, at every start.
     """
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     if folder is None:
-        folder = str(platformdirs.user_cache_path("cmedirl_jax", appauthor=False) / "compiled")
+        try:
+            users = platformdirs.user_cache_path("cmedirl_jax", appauthor=False) / "compiled"
+            atomic.check_writable(users)
+        except (OSError, RuntimeError):
+            return
+        folder = str(users)
         jax.config.update("jax_compilation_cache_dir", folder)
     # Small programs too: there are many, and each would be compiled at every start.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

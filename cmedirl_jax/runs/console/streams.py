@@ -3,6 +3,7 @@
 import contextlib
 import os
 import sys
+from collections.abc import Iterator
 from typing import TextIO, cast
 
 
@@ -38,6 +39,17 @@ def complain(line: str) -> None:
     """Print a line on standard error, if that is still there."""
     if sys.stderr is not None:
         print(line, file=_dispensable(sys.stderr), flush=True)
+
+
+@contextlib.contextmanager
+def unfailing() -> Iterator[None]:
+    """Let whatever prints in this block do without the stream that is closed or fails."""
+    with contextlib.ExitStack() as stack:
+        nowhere = stack.enter_context(open(os.devnull, "w"))
+        stack.enter_context(contextlib.redirect_stdout(_dispensable(sys.stdout) or nowhere))
+        stack.enter_context(contextlib.redirect_stderr(_dispensable(sys.stderr) or nowhere))
+        stack.callback(flush)
+        yield
 
 
 def flush() -> None:

@@ -5,7 +5,6 @@ import hashlib
 import importlib.metadata
 import json
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -53,9 +52,7 @@ def check(folder: Path, config: dict[str, Any]) -> None:
         for name in FOLDERS:
             if (folder / name).exists() and not (folder / name).is_dir():
                 raise UserError(f"--out: {folder / name} is in the way; a folder belongs there")
-        nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-        with tempfile.TemporaryFile(dir=nearest):
-            pass
+        atomic.check_writable(folder)
     except OSError as error:
         raise UserError(f"--out: cannot write to {folder} ({error.strerror})") from error
 

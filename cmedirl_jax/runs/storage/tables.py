@@ -9,11 +9,10 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from cmedirl_jax.io import atomic
 from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.gymnasium_replay import Replay
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.storage import cells
+from cmedirl_jax.runs.storage import cells, outputs
 from cmedirl_jax.runs.storage.cells import TABLES, CellKey, SavedCell
 
 FILES = tuple(f"{name}.parquet" for name in TABLES)
@@ -158,13 +157,4 @@ def write(folder: Path, tables: dict[str, pl.DataFrame]) -> None:
     for name, table in tables.items():
         buffer = io.BytesIO()
         table.write_parquet(buffer)
-        write_if_other(folder / f"{name}.parquet", buffer.getvalue())
-
-
-def write_if_other(path: Path, content: bytes) -> bool:
-    """Write a file, unless it has this content; returns whether it was written."""
-    if path.is_file() and path.read_bytes() == content:
-        return False
-    with atomic.replacing(path) as partial:
-        partial.write_bytes(content)
-    return True
+        outputs.write(folder / f"{name}.parquet", buffer.getvalue())

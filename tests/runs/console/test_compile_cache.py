@@ -61,6 +61,27 @@ def test_the_cache_lies_in_the_users_cache_folder(configured, tmp_path, monkeypa
     assert any((tmp_path / "cmedirl_jax" / "compiled").iterdir())
 
 
+@pytest.mark.parametrize("error", [RuntimeError("no home"), OSError("read-only")])
+def test_a_user_without_a_home_has_no_cache(configured, monkeypatch, error):
+    def user_cache_path(*_, **__):
+        raise error
+
+    jax.config.update("jax_compilation_cache_dir", None)
+    monkeypatch.setattr(compile_cache.platformdirs, "user_cache_path", user_cache_path)
+    compile_cache.use_cache()
+    assert jax.config.jax_compilation_cache_dir is None
+
+
+def test_a_cache_that_cannot_be_written_is_not_used(configured, tmp_path, monkeypatch):
+    jax.config.update("jax_compilation_cache_dir", None)
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(
+        compile_cache.platformdirs, "user_cache_path", lambda *_, **__: tmp_path / "file"
+    )
+    compile_cache.use_cache()
+    assert jax.config.jax_compilation_cache_dir is None
+
+
 def test_a_cache_that_jax_was_given_is_kept(configured, tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     compile_cache.use_cache()
