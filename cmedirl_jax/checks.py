@@ -1,13 +1,17 @@
 """Checks of arguments by name. They run while tracing and cost nothing in a compiled program."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax.types import EnvSpec, Numeric, Transition
+
+LARGEST_ARRAY = 2**28
+"""The most numbers of an array whose size is a power of the dimensions: 1 GiB in float32."""
 
 _KINDS = {
     jnp.floating: "floats",
@@ -122,6 +126,26 @@ def _at_least(low: int, named: Mapping[str, int]) -> None:
             raise TypeError(f"{name}: expected an integer, got {size}")
         if _known(size) and size < low:
             raise ValueError(f"{name} must be at least {low}, got {size}")
+
+
+def array_size(name: str, shape: Sequence[int], remedy: str) -> None:
+    """Check that an array whose size is a power of the dimensions has at most `LARGEST_ARRAY`.
+
+    Args:
+        name: of the array, for the message.
+        shape: its shape, before it is made.
+        remedy: which option to change.
+
+    Raises:
+        ValueError: with its size and the remedy.
+    """
+    # Exact, and printable where it is beyond a float.
+    size = Decimal(math.prod(map(int, shape)))
+    if size > LARGEST_ARRAY:
+        raise ValueError(
+            f"{name} would be {size:.3g} numbers ({size / 2**28:.3g} GiB in float32), "
+            f"more than 2^28: {remedy}"
+        )
 
 
 def shares(**named: Numeric) -> None:

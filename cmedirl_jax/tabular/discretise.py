@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmedirl_jax import checks
 from cmedirl_jax import grids as grids_lib
 from cmedirl_jax.envs import Env, Step
 from cmedirl_jax.tabular import interpolation
@@ -63,12 +64,18 @@ def make(
             over the cell around its point; 1 takes the point itself.
 
     Raises:
-        ValueError: if the environment has no `state_at`, an infinite bound, or other dimensions.
+        ValueError: if the environment has no `state_at`, an infinite bound, or other dimensions,
+            or the dynamics are above `checks.LARGEST_ARRAY`.
     """
     if env.state_at is None:
         raise ValueError(f"{env.spec.id} does not say which state an observation is of")
     if subsamples < 1:
         raise ValueError(f"subsamples must be at least 1, got {subsamples}")
+    checks.array_size(
+        "the dynamics [S, A, successors]",
+        (*state_shape, *action_shape, *[2 * subsamples] * len(state_shape)),
+        "take fewer states, actions or subsamples",
+    )
     states, actions = grids(env.spec, state_shape, action_shape)
     within = (np.arange(subsamples) + 0.5) / subsamples - 0.5
     offsets = grids_lib.product(*[within] * len(states.shape))

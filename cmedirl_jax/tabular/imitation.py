@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from cmedirl_jax import checks
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.data.hot_start_data import HotStartData
 from cmedirl_jax.envs import Env
@@ -79,18 +80,39 @@ def discretised(
         ValueError: what `discretise.make` raises.
     """
     settings = settings or TabularSettings()
-    states, actions = grids(env.spec, settings)
     return discretise.make(
-        env, states.shape, actions.shape, params=params, subsamples=settings.subsamples
+        env, *_shapes(env.spec, settings), params=params, subsamples=settings.subsamples
     )
 
 
 def grids(spec: EnvSpec, settings: TabularSettings) -> tuple[Grid, Grid]:
     """The grids of the observations and of the actions."""
-    return discretise.grids(
-        spec,
-        (settings.states,) * spec.observation_dim,
-        (settings.actions,) * spec.action_dim,
+    return discretise.grids(spec, *_shapes(spec, settings))
+
+
+def _shapes(spec: EnvSpec, settings: TabularSettings) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Points along each dimension of the observation, and of the action."""
+    return (settings.states,) * spec.observation_dim, (settings.actions,) * spec.action_dim
+
+
+def check(spec: EnvSpec, kind: Kind, settings: TabularSettings) -> None:
+    """Check how much a reward holds of all states (and actions) of the grid, before it is made.
+
+    Raises:
+        ValueError: if that is above `checks.LARGEST_ARRAY`.
+    """
+    states, actions = _shapes(spec, settings)
+    pairs, of_action = states, 1
+    if settings.reward == "state-action":
+        pairs, of_action = (*states, *actions), 1 + 2 * spec.action_dim
+    if kind == "linear":
+        features, what = (*[settings.centres] * spec.observation_dim, of_action), "centres"
+    else:
+        features, what = (max(settings.hidden, default=1),), "hidden units"
+    checks.array_size(
+        "the reward's features [S, A, F]",
+        (*pairs, *features),
+        f"take fewer states, actions or {what}",
     )
 
 
@@ -117,8 +139,13 @@ def fit(
         subset: which of them; default all.
         kind: "linear" or "deep".
         settings: every other choice.
+
+    Raises:
+        ValueError: what `check` raises.
     """
-    fit_one = functools.partial(_fit, spec=spec, kind=kind, settings=settings or TabularSettings())
+    settings = settings or TabularSettings()
+    check(spec, kind, settings)
+    fit_one = functools.partial(_fit, spec=spec, kind=kind, settings=settings)
     return jax.custom_batching.sequential_vmap(fit_one)(key, mdp, data, subset)
 
 
@@ -182,6 +209,9 @@ def visitation(
         data: the pool.
         subset: which of its demonstrations; default all.
         discount: gamma, per environment step.
+
+    Raises:
+        ValueError: if the visits `[N, 2^O, 2^A]` are above `checks.LARGEST_ARRAY`.
     """
     pool = jax.tree.map(jnp.asarray, data.episodes)
     chosen = pool if subset is None else subset
@@ -193,6 +223,11 @@ def visitation(
     time = row - pool.start[episode]
     state, state_weight = interpolation.interpolate(mdp.states, data.transition.observation)
     action, action_weight = interpolation.interpolate(mdp.actions, data.transition.action)
+    checks.array_size(
+        "the demonstrations' visits [N, 2^O, 2^A]",
+        (*state.shape, action.shape[-1]),
+        "take fewer demonstrations",
+    )
     visits = (weight[episode] * discount**time)[:, None] * state_weight  # [N, 2^O]
     both = visits[:, :, None] * action_weight[:, None, :]
     starts = jnp.where(time == 0, weight[episode], 0.0)[:, None] * state_weight

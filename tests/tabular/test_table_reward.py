@@ -1,9 +1,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from cmedirl_jax.irl import IRLHParams, shaping
 from cmedirl_jax.tabular import discretise, interpolation, table_reward
+from cmedirl_jax.tabular.interpolation import Grid
 from tests.support import pools
 
 STATES, ACTIONS = discretise.grids(pools.ENV.spec, (6, 5), (3,))
@@ -34,6 +36,12 @@ def test_it_learns_nothing():
     nothing = LEARNER.reward(LEARNER.init(jax.random.key(0)), *batch[:2])
     assert nothing.tolist() == [0.0] * 4
     np.testing.assert_array_equal(shaping.additive(batch.reward, nothing), batch.reward)
+
+
+def test_a_table_is_refused_before_it_is_made():
+    states = Grid((0.0,) * 4, (1.0,) * 4, (41,) * 4)
+    with pytest.raises(ValueError, match=r"a table of rewards would be 9\.69e\+8 numbers"):
+        table_reward.make(states, Grid((0.0,) * 3, (1.0,) * 3, (7,) * 3))
 
 
 def test_a_table_of_zeros_stays_zero():
