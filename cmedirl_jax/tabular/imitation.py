@@ -213,6 +213,12 @@ def visitation(
     Raises:
         ValueError: if the visits `[N, 2^O, 2^A]` are above `checks.LARGEST_ARRAY`.
     """
+    corners = [2] * len(mdp.states.shape + mdp.actions.shape)
+    checks.array_size(
+        "the demonstrations' visits [N, 2^O, 2^A]",
+        (*jnp.shape(data.transition.reward), *corners),
+        "take fewer demonstrations",
+    )
     pool = jax.tree.map(jnp.asarray, data.episodes)
     chosen = pool if subset is None else subset
     drawn = jnp.searchsorted(pool.start, chosen.start)
@@ -223,11 +229,6 @@ def visitation(
     time = row - pool.start[episode]
     state, state_weight = interpolation.interpolate(mdp.states, data.transition.observation)
     action, action_weight = interpolation.interpolate(mdp.actions, data.transition.action)
-    checks.array_size(
-        "the demonstrations' visits [N, 2^O, 2^A]",
-        (*state.shape, action.shape[-1]),
-        "take fewer demonstrations",
-    )
     visits = (weight[episode] * discount**time)[:, None] * state_weight  # [N, 2^O]
     both = visits[:, :, None] * action_weight[:, None, :]
     starts = jnp.where(time == 0, weight[episode], 0.0)[:, None] * state_weight
