@@ -4,8 +4,10 @@ The checks run while tracing or on the host, and cost nothing in a compiled prog
 dtypes are always checked; values where they are known on the host, so those of traced arrays pass.
 """
 
+import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
 from typing import Any
 
 import jax.numpy as jnp
@@ -18,6 +20,9 @@ from cmedirl_jax.types import Array, EnvSpec, Numeric, Transition
 ROUNDINGS = 100.0
 """Roundings by which two numbers may differ and still count as equal. Steps of Gymnasium's own
 MountainCarContinuous-v0 differ from ours by less than 1."""
+
+LARGEST_ARRAY = 2**28
+"""The most numbers of an array whose size is a power of the dimensions: 1 GiB in float32."""
 
 _KINDS = {
     jnp.floating: "floats",
@@ -158,6 +163,26 @@ def _at_least(low: int, named: Mapping[str, Any]) -> None:
             raise TypeError(f"{name}: expected an integer, got {size}") from None
         if number < low:
             raise ValueError(f"{name} must be at least {low}, got {size}")
+
+
+def array_size(name: str, shape: Sequence[int], remedy: str) -> None:
+    """Check that an array whose size is a power of the dimensions has at most `LARGEST_ARRAY`.
+
+    Args:
+        name: of the array, for the message.
+        shape: its shape, before it is made.
+        remedy: which option to change.
+
+    Raises:
+        ValueError: with its size and the remedy.
+    """
+    # Exact, and printable where it is beyond a float.
+    size = Decimal(math.prod(map(int, shape)))
+    if size > LARGEST_ARRAY:
+        raise ValueError(
+            f"{name} would be {size:.3g} numbers ({size / 2**28:.3g} GiB in float32), "
+            f"more than 2^28: {remedy}"
+        )
 
 
 def shares(**named: Numeric | Array) -> None:

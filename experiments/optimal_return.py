@@ -90,18 +90,25 @@ def optimal_returns(options: Options) -> pl.DataFrame:
     of the policy that looks one step ahead by it.
 
     Raises:
-        ValueError: for an unknown environment, one that cannot be discretised, or a number out of
-            its range.
+        ValueError: for an unknown environment, one that cannot be discretised, a number out of
+            its range, or a grid that is too large.
     """
     for name, wrong in ranges.out_of_range(options):
         raise ValueError(f"--{name}: {wrong}")
     env = envs.make(options.env)
     spec, params = env.spec, env.default_params
     first = np.asarray(env.starts(options.starts, params)[1])
+    actions = (options.actions,) * spec.action_dim
+    makes = [
+        functools.partial(discretise.make, env, (size,) * spec.observation_dim, actions)
+        for size in options.states
+    ]
+    # A grid that is too large is refused before the others are solved.
+    for make in makes:
+        jax.eval_shape(make)
     rows = []
-    for size in options.states:
-        shapes = (size,) * spec.observation_dim, (options.actions,) * spec.action_dim
-        mdp = jax.jit(functools.partial(discretise.make, env, *shapes))()
+    for size, make in zip(options.states, makes, strict=True):
+        mdp = jax.jit(make)()
         for discount, horizon in ((1.0, spec.max_episode_steps), (options.discount, None)):
             solve = jax.jit(functools.partial(_solve, env=env, horizon=horizon))
             value, attained, attained_return = jax.device_get(solve(mdp, first, discount))

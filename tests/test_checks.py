@@ -1,3 +1,5 @@
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -447,6 +449,19 @@ def test_sizes_are_whole_numbers(check):
             check(size=wrong)
     with pytest.raises(ValueError, match=r"size must be at least \d, got -1"):
         check(size=jnp.int32(-1))
+
+
+def test_an_array_is_refused_by_its_size_before_it_is_made():
+    checks.array_size("it", (2**14, 2**14), "")
+    # Neither numpy's integers nor a float hold the last two.
+    for shape, size in (
+        ((2**14, 2**14 + 1), "2.68e+8 numbers (1.00 GiB in float32)"),
+        ((np.int64(2**40),) * 2, "1.21e+24 numbers (4.50e+15 GiB in float32)"),
+        ((41,) * 376, "2.55e+606 numbers (9.50e+597 GiB in float32)"),
+    ):
+        line = f"it would be {size}, more than 2^28: take less"
+        with pytest.raises(ValueError, match=f"^{re.escape(line)}$"):
+            checks.array_size("it", shape, "take less")
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.1, float("nan"), np.float32(2.0)])

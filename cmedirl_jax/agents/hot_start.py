@@ -4,8 +4,13 @@
     params = hot_start.fit(key, agent.networks, params, data)
     state = agent.init(key, params)
 
-The actor is regressed on the demonstrated actions. The critic is a 'DAQN': its values at `cells`
-evenly spaced actions per dimension are fitted to a target that singles out the demonstrated action.
+The actor is regressed on the demonstrated actions. The critic is a 'DAQN': its values at actions
+a_1..K are fitted to a target that singles out the demonstrated action. These actions are evenly
+spaced along one dimension of the action, while the other dimensions keep their demonstrated values;
+the loss is the mean over the dimensions. A pair thus takes K A actions, where a full grid would
+take K^A. With one dimension the two are the same. With more, softmaxes along the dimensions are the
+marginals of the softmax over a full grid wherever Q is a sum of functions of one dimension each.
+
 The paper's loss (a softmax over actions, a squared error to a one-hot array) is not defined for a
 continuous critic. `HotStartHParams.critic` chooses among three readings of it and two other losses:
 
@@ -28,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cmedirl_jax import checks, grids, ranges
+from cmedirl_jax import checks, ranges
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.hot_start_data import HotStartData, prepare
@@ -50,7 +55,7 @@ class HotStartHParams(flax.struct.PyTreeNode):
         margin: For the "large-margin" loss: by how much the demonstrated action's value has to
             exceed the others, in units of the value.
         critic: The critic's loss, in the order H0 to H4 of `agents.hot_start`.
-        cells: Evenly spaced values per action dimension, bounds included; K = cells^A actions.
+        cells: K, evenly spaced values along each action dimension, bounds included.
         steps: Gradient steps on each network.
         batch_size: Demonstrated environment steps per gradient step.
     """
@@ -172,28 +177,23 @@ def critic_loss(
         q, critic = evaluate(critic, observation, action)
         return jnp.mean(jnp.square(q - discounted_return)), critic
 
-    # The cells' values [B, K], with the demonstrated action in its cell where the loss says so.
+    # N = B A lines, one for each pair and dimension.
     spec = networks.spec
-    cells = jnp.asarray(action_cells(spec, hparams.cells))
-    half_width = 0.5 * (spec.action_high - spec.action_low)
-    squared_distance = jnp.sum(jnp.square((cells - action[:, None, :]) / half_width), axis=-1)
-    nearest = jax.nn.one_hot(jnp.argmin(squared_distance, axis=-1), len(cells), dtype=jnp.float32)
-    actions = jnp.broadcast_to(cells, (*squared_distance.shape, spec.action_dim))
-    if hparams.critic in ("one-hot", "large-margin"):
-        actions = jnp.where(nearest[..., None] > 0, action[:, None, :], actions)
+    actions, nearest, squared_distance = _lines(spec, hparams, action)
+    along = functools.partial(jnp.repeat, repeats=spec.action_dim, axis=0)
     observations = jnp.broadcast_to(
-        observation[:, None, :], (*squared_distance.shape, spec.observation_dim)
+        along(observation)[:, None], (*nearest.shape, spec.observation_dim)
     )
     q, critic = evaluate(critic, observations, actions)
 
-    # The loss of each step [B].
+    # The loss of each line [N].
     match hparams.critic:
         case "softmax":
             error = _squared_error(jax.nn.softmax(q, axis=-1), nearest)
         case "one-hot":
             error = _squared_error(q, nearest)
         case "quadratic":
-            target = discounted_return[:, None] - hparams.curvature * squared_distance
+            target = along(discounted_return)[:, None] - hparams.curvature * squared_distance
             error = _squared_error(q, target)
         case "large-margin":
             best = jnp.max(q + hparams.margin * (1.0 - nearest), axis=-1)
@@ -201,11 +201,37 @@ def critic_loss(
     return jnp.mean(error), critic
 
 
+def _lines(
+    spec: EnvSpec, hparams: HotStartHParams, action: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The grid along each dimension of actions `[B, A]`, the other dimensions as they are.
+
+    Returns:
+        actions `[N, K, A]`, `N = B A`, the dimension fastest; one-hot arrays `[N, K]` of the
+        cell that the demonstrated action is in; and squared distances to that action `[N, K]`,
+        in half-widths of the action range.
+    """
+    size, dims = action.shape
+    cells = jnp.tile(action_cells(spec, hparams.cells), (size, 1))
+    half_width = jnp.tile(0.5 * (spec.action_high - spec.action_low), size)
+    demonstrated = action.reshape(-1, 1)
+    squared_distance = jnp.square((cells - demonstrated) / half_width[:, None])
+    nearest = jax.nn.one_hot(
+        jnp.argmin(squared_distance, axis=-1), hparams.cells, dtype=jnp.float32
+    )
+    if hparams.critic in ("one-hot", "large-margin"):
+        cells = jnp.where(nearest > 0, demonstrated, cells)
+    moved = jnp.tile(jnp.eye(dims, dtype=bool), (size, 1))
+    others = jnp.repeat(action, dims, axis=0)
+    actions = jnp.where(moved[:, None], cells[..., None], others[:, None])
+    return actions, nearest, squared_distance
+
+
 def _squared_error(q: jax.Array, target: jax.Array) -> jax.Array:
-    """Summed over the cells: `[B, K]` -> `[B]`."""
+    """Summed over the cells: `[N, K]` -> `[N]`."""
     return jnp.sum(jnp.square(q - target), axis=-1)
 
 
 def action_cells(spec: EnvSpec, cells: int) -> np.ndarray:
-    """The product grid of `cells` values per action dimension, bounds included: `[cells^A, A]`."""
-    return grids.product(*np.linspace(spec.action_low, spec.action_high, cells).T)
+    """`cells` evenly spaced values along each action dimension, bounds included: `[A, cells]`."""
+    return np.linspace(spec.action_low, spec.action_high, cells, axis=-1)

@@ -34,6 +34,9 @@ NetworkName = Literal["deep", "radial-basis", "fourier"]
 """The names in `NETWORKS`."""
 
 
+_FEWER_CENTRES, _LOWER_ORDER = "take fewer centres", "take a lower order"
+
+
 @dataclasses.dataclass(frozen=True)
 class RewardNetworkSettings:
     """The reward network. All static.
@@ -146,14 +149,16 @@ def radial_basis(spec: EnvSpec, centres: int, inputs: Inputs = "state-action") -
     of the action whose coefficients vary over the states.
 
     Raises:
-        ValueError: if there are fewer than two centres, or the observation has an infinite bound.
+        ValueError: if there are fewer than two centres, the observation has an infinite bound, or
+            the grid, or later the features of a batch, are above `checks.LARGEST_ARRAY`.
     """
     checks.env_spec(spec)
     if centres < 2:
         raise ValueError(f"radial basis functions need two centres or more, got {centres}")
-    scale = networks.observation_scaling(spec)
+    scale, dims = networks.observation_scaling(spec), spec.observation_dim
+    checks.array_size("radial basis functions", (*[centres] * dims, dims), _FEWER_CENTRES)
     axis = np.linspace(-1.0, 1.0, centres)
-    grid = grids.product(*[axis] * spec.observation_dim)
+    grid = grids.product(*[axis] * dims)
     width = np.float32(axis[1] - axis[0])
     return functools.partial(_radial_basis, spec, inputs, scale, grid.astype(np.float32), width)
 
@@ -168,6 +173,8 @@ def _radial_basis(
     action: Array,
 ) -> jax.Array:
     checks.pairs(spec, observation, None if inputs == "state" else action)
+    size = (*observation.shape[:-1], len(grid), 1 if inputs == "state" else 1 + 2 * spec.action_dim)
+    checks.array_size("radial basis functions", size, _FEWER_CENTRES)
     away = (scale(jnp.asarray(observation))[..., None, :] - grid) / width
     local = jax.nn.softmax(-0.5 * jnp.sum(jnp.square(away), axis=-1), axis=-1)
     if inputs == "state":
@@ -186,7 +193,8 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
     the `d` inputs scaled to [0, 1]: the observation, and then the action.
 
     Raises:
-        ValueError: if the order is less than one, or the observation has an infinite bound.
+        ValueError: if the order is less than one, an input has an infinite bound, or the
+            frequencies, or later the features of a batch, are above `checks.LARGEST_ARRAY`.
     """
     checks.env_spec(spec)
     if order < 1:
@@ -196,6 +204,7 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
         low, high = np.append(low, spec.action_low), np.append(high, spec.action_high)
     if not np.isfinite([low, high]).all():
         raise ValueError(f"{spec.id}: a Fourier basis needs finite bounds, got {low} and {high}")
+    checks.array_size("a Fourier basis", (*[order + 1] * len(low), len(low)), _LOWER_ORDER)
     frequencies = np.pi * grids.product(*[np.arange(order + 1.0)] * len(low))
     return functools.partial(_fourier, spec, inputs, low, high, frequencies.astype(np.float32))
 
@@ -212,6 +221,8 @@ def _fourier(
     checks.pairs(spec, observation, None if inputs == "state" else action)
     if inputs == "state-action":
         observation = jnp.concatenate([observation, action], axis=-1)
+    size = (*observation.shape[:-1], len(frequencies))
+    checks.array_size("a Fourier basis", size, _LOWER_ORDER)
     x = (observation - low) / (high - low)
     return jnp.cos(jnp.sum(x[..., None, :] * frequencies, axis=-1))
 

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from cmedirl_jax import checks, envs, networks, ranges
 from cmedirl_jax.agents.exploration import ExplorationSettings
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
-from cmedirl_jax.irl import rewards
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.cluster.base import ALONE, Cluster
 from cmedirl_jax.runs.config import DemosCheck, Expert, ExpertSettings, StudyConfig
@@ -21,8 +21,10 @@ from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import cells, plain
 from cmedirl_jax.tabular import imitation
 from cmedirl_jax.training import compose
+from cmedirl_jax.training.compose import Algorithm
 from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.settings import Settings
+from cmedirl_jax.types import EnvSpec
 
 
 class Plan(NamedTuple):
@@ -180,17 +182,36 @@ def _check_parts(config: StudyConfig, env: Env, capacity: int) -> None:
         networks.make(env.spec, config.settings.architecture)
     except ValueError as error:
         raise UserError(f"--architecture: {error}") from error
+    tabular = config.settings.tabular
     if any(METHODS[name].tabular for name in config.methods):
         try:
-            jax.eval_shape(lambda: imitation.discretised(env, config.settings.tabular))
-            rewards.radial_basis(env.spec, config.settings.tabular.centres)
+            jax.eval_shape(lambda: imitation.discretised(env, tabular))
+            for name in config.methods:
+                if kind := METHODS[name].tabular:
+                    imitation.check(env.spec, kind, tabular)
         except ValueError as error:
             raise UserError(f"--tabular: {error}") from error
     for name in config.methods:
         try:
-            compose.compose(env.spec, METHODS[name], config.settings, capacity)
+            parts = compose.compose(env.spec, METHODS[name], config.settings, capacity)
+            _check_reward_batch(env.spec, parts)
         except ValueError as error:
             raise UserError(f"--methods {name}: {error}") from error
+
+
+def _check_reward_batch(spec: EnvSpec, parts: Algorithm) -> None:
+    """Trace the reward of all pairs of an update, whose features may be too many."""
+    learner, sampler = parts.learner, parts.sampler
+    if learner is None or sampler is None:
+        return
+    pairs = 2 * sampler.batch_size * (1 if sampler.shares_pairs else spec.max_episode_steps)
+    observation, action = (
+        jax.ShapeDtypeStruct((pairs, dim), jnp.float32)
+        for dim in (spec.observation_dim, spec.action_dim)
+    )
+    jax.eval_shape(
+        lambda *pair: learner.reward(learner.init(jax.random.key(0)), *pair), observation, action
+    )
 
 
 def _check_ranges(config: StudyConfig) -> None:

@@ -64,11 +64,17 @@ def make(
             over the cell around its point; 1 takes the point itself.
 
     Raises:
-        ValueError: if the environment has no `state_at`, an infinite bound, or other dimensions.
+        ValueError: if the environment has no `state_at`, an infinite bound, or other dimensions,
+            or the dynamics are above `checks.LARGEST_ARRAY`.
     """
     if env.state_at is None:
         raise ValueError(f"{env.spec.id} does not say which state an observation is of")
     checks.sizes(subsamples=subsamples)
+    checks.array_size(
+        "the dynamics [S, A, successors]",
+        (*state_shape, *action_shape, *[2 * subsamples] * len(state_shape)),
+        "take fewer states, actions or subsamples",
+    )
     states, actions = grids(env.spec, state_shape, action_shape)
     within = (np.arange(subsamples) + 0.5) / subsamples - 0.5
     offsets = grids_lib.product(*[within] * len(states.shape))

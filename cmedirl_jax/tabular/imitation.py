@@ -83,18 +83,39 @@ def discretised(
     """
     settings = settings or TabularSettings()
     ranges.check(settings)
-    states, actions = grids(env.spec, settings)
     return discretise.make(
-        env, states.shape, actions.shape, params=params, subsamples=settings.subsamples
+        env, *_shapes(env.spec, settings), params=params, subsamples=settings.subsamples
     )
 
 
 def grids(spec: EnvSpec, settings: TabularSettings) -> tuple[Grid, Grid]:
     """The grids of the observations and of the actions."""
-    return discretise.grids(
-        spec,
-        (settings.states,) * spec.observation_dim,
-        (settings.actions,) * spec.action_dim,
+    return discretise.grids(spec, *_shapes(spec, settings))
+
+
+def _shapes(spec: EnvSpec, settings: TabularSettings) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Points along each dimension of the observation, and of the action."""
+    return (settings.states,) * spec.observation_dim, (settings.actions,) * spec.action_dim
+
+
+def check(spec: EnvSpec, kind: Kind, settings: TabularSettings) -> None:
+    """Check how much a reward holds of all states (and actions) of the grid, before it is made.
+
+    Raises:
+        ValueError: if that is above `checks.LARGEST_ARRAY`.
+    """
+    states, actions = _shapes(spec, settings)
+    pairs, of_action = states, 1
+    if settings.reward == "state-action":
+        pairs, of_action = (*states, *actions), 1 + 2 * spec.action_dim
+    if kind == "linear":
+        features, what = (*[settings.centres] * spec.observation_dim, of_action), "centres"
+    else:
+        features, what = (max(settings.hidden, default=1),), "hidden units"
+    checks.array_size(
+        "the reward's features [S, A, F]",
+        (*pairs, *features),
+        f"take fewer states, actions or {what}",
     )
 
 
@@ -123,10 +144,11 @@ def fit(
         settings: every other choice.
 
     Raises:
-        ValueError: as `visitation`, or if a setting is out of range.
+        ValueError: as `visitation` and `check`, or if a setting is out of range.
     """
     settings = settings or TabularSettings()
     ranges.check(settings)
+    check(spec, kind, settings)
     _check_subset(data, subset)
     fit_one = functools.partial(_fit, spec=spec, kind=kind, settings=settings)
     return jax.custom_batching.sequential_vmap(fit_one)(key, mdp, data, subset)
@@ -194,11 +216,18 @@ def visitation(
         discount: gamma, per environment step.
 
     Raises:
-        ValueError: if a known subset has no step, or an episode that the pool does not have, or the
-            discount is not between 0 and 1.
+        ValueError: if a known subset has no step, or an episode that the pool does not have, the
+            discount is not between 0 and 1, or the visits `[N, 2^O, 2^A]` are above
+            `checks.LARGEST_ARRAY`.
     """
     checks.shares(discount=discount)
     _check_subset(data, subset)
+    corners = [2] * len(mdp.states.shape + mdp.actions.shape)
+    checks.array_size(
+        "the demonstrations' visits [N, 2^O, 2^A]",
+        (*jnp.shape(data.transition.reward), *corners),
+        "take fewer demonstrations",
+    )
     pool = jax.tree.map(jnp.asarray, data.episodes)
     chosen = pool if subset is None else subset
     drawn = jnp.searchsorted(pool.start, chosen.start)

@@ -1,7 +1,6 @@
 """Regular grids over a box, with multilinear interpolation between their points."""
 
 import dataclasses
-import itertools
 import math
 
 import jax
@@ -15,6 +14,9 @@ from cmedirl_jax.types import Array
 @dataclasses.dataclass(frozen=True)
 class Grid:
     """Evenly spaced points of a box, its bounds included. Static and hashable.
+
+    Raises ValueError for bounds and shapes that do not fit each other, and for more points than
+    `checks.LARGEST_ARRAY` allows.
 
     Attributes:
         low: lower bound of each of the `D` dimensions.
@@ -38,6 +40,11 @@ class Grid:
             raise ValueError(f"a grid needs finite bounds, got {self.low} and {self.high}")
         if not np.all(np.less(self.low, self.high)):
             raise ValueError(f"a grid's low must be below its high, got {self.low} and {self.high}")
+        checks.array_size(
+            "a grid's points",
+            (*self.shape, len(self.shape)),
+            "take fewer along each dimension",
+        )
 
     @property
     def size(self) -> int:
@@ -73,7 +80,7 @@ def interpolate(grid: Grid, position: Array) -> tuple[jax.Array, jax.Array]:
     steps = jnp.clip(steps, 0.0, (shape - 1).astype(np.float32))
     below = jnp.minimum(steps.astype(jnp.int32), shape - 2)
     fraction = steps - below
-    corners = np.array(list(itertools.product((0, 1), repeat=len(shape))))  # [2^D, D]
+    corners = grids.product(*[np.arange(2)] * len(shape))  # [2^D, D]
     index = jnp.ravel_multi_index(
         tuple(jnp.moveaxis(below[..., None, :] + corners, -1, 0)), grid.shape, mode="clip"
     )

@@ -19,7 +19,12 @@ def make(states: Grid, actions: Grid, hparams: IRLHParams | None = None) -> Rewa
         states: grid of the observations.
         actions: grid of the actions.
         hparams: only `bound` is read.
+
+    Raises:
+        ValueError: if the table is above `checks.LARGEST_ARRAY`.
     """
+    size = (states.size, actions.size)
+    checks.array_size("a table of rewards", size, "take fewer states or actions")
     return RewardLearner(
         init=functools.partial(_init, states, actions, hparams or IRLHParams()),
         reward=functools.partial(_reward, states, actions),

@@ -1,3 +1,6 @@
+import functools
+import math
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -5,53 +8,72 @@ import numpy as np
 import pytest
 import scipy.special
 
+from cmedirl_jax import networks
 from cmedirl_jax.agents import ddpg, hot_start
 from cmedirl_jax.agents.hot_start import HotStartHParams
 from cmedirl_jax.data import demonstrations
+from cmedirl_jax.networks import Architecture
 from cmedirl_jax.training import evaluation
 from cmedirl_jax.types import Network
 from tests.support import pools, reference
-from tests.support.agents import PROBE, SMALL, SPEC, random_batch, reference_q
+from tests.support.agents import ARCHITECTURE, SMALL, SPEC, random_batch, reference_q, scaled
 
+KINDS = ["softmax", "one-hot", "quadratic", "monte-carlo", "large-margin"]
 # Smaller than the small network's differences of values, so that one step has no loss.
 MARGIN = 0.02
 
 
+def of_actions(dims):
+    """The small networks of the car, had it actions of `dims` dimensions."""
+    spec = SPEC._replace(
+        action_dim=dims,
+        action_low=np.full(dims, -1.0, np.float32),
+        action_high=np.full(dims, 1.0, np.float32),
+    )
+    return networks.make(spec, ARCHITECTURE)
+
+
 def reference_critic_loss(kind, critic, batch, returns, cells=5):
     grid = np.linspace(-1.0, 1.0, cells)
-    total = 0.0
+    losses = []
     for observation, action, g in zip(
-        np.asarray(batch.observation), np.asarray(batch.action)[:, 0], returns, strict=True
+        np.asarray(batch.observation), np.asarray(batch.action), returns, strict=True
     ):
         if kind == "monte-carlo":
-            total += (reference_q(critic, observation[None], action[None, None])[0] - g) ** 2
+            losses.append((reference_q(critic, observation[None], action[None])[0] - g) ** 2)
             continue
-        nearest = np.argmin(abs(grid - action))
-        actions = grid.copy()
-        if kind in ("one-hot", "large-margin"):
-            actions[nearest] = action
-        q = reference_q(critic, np.tile(observation, (cells, 1)), actions[:, None])
-        if kind == "large-margin":
-            total += max(q[k] + MARGIN * (k != nearest) for k in range(cells)) - q[nearest]
-            continue
-        target = np.eye(cells)[nearest]
-        if kind == "softmax":
-            q = scipy.special.softmax(q)
-        if kind == "quadratic":
-            target = g - 20.0 * (actions - action) ** 2
-        total += np.sum((q - target) ** 2)
-    return total / len(returns)
+        for dimension, demonstrated in enumerate(action):
+            nearest = np.argmin(abs(grid - demonstrated))
+            values = grid.copy()
+            if kind in ("one-hot", "large-margin"):
+                values[nearest] = demonstrated
+            actions = np.tile(action, (cells, 1))
+            actions[:, dimension] = values
+            q = reference_q(critic, np.tile(observation, (cells, 1)), actions)
+            if kind == "large-margin":
+                margin = MARGIN * (np.arange(cells) != nearest)
+                losses.append(max(q + margin) - q[nearest])
+                continue
+            target = np.eye(cells)[nearest]
+            if kind == "softmax":
+                q = scipy.special.softmax(q)
+            if kind == "quadratic":
+                target = g - 20.0 * (values - demonstrated) ** 2
+            losses.append(np.sum((q - target) ** 2))
+    return np.mean(losses)
 
 
-@pytest.mark.parametrize("kind", ["softmax", "one-hot", "quadratic", "monte-carlo", "large-margin"])
-def test_critic_loss_and_gradient_equal_a_float64_reference(kind):
+@pytest.mark.parametrize("dims", [1, 2])
+@pytest.mark.parametrize("kind", KINDS)
+def test_critic_loss_and_gradient_equal_a_float64_reference(kind, dims):
     hparams = HotStartHParams(critic=kind, cells=5, margin=MARGIN)
-    batch, returns = random_batch(jax.random.key(0), 6), np.linspace(-10.0, 90.0, 6)
-    critic = SMALL.critic.init(jax.random.key(1))
+    small = of_actions(dims)
+    batch, returns = random_batch(jax.random.key(0), 6, small.spec), np.linspace(-10.0, 90.0, 6)
+    critic = small.critic.init(jax.random.key(1))
 
     def loss(critic):
         return hot_start.critic_loss(
-            SMALL, critic, hparams, batch.observation, batch.action, jnp.asarray(returns)
+            small, critic, hparams, batch.observation, batch.action, jnp.asarray(returns)
         )[0]
 
     value, gradient = jax.value_and_grad(loss)(critic)
@@ -65,16 +87,92 @@ def test_critic_loss_and_gradient_equal_a_float64_reference(kind):
     )
 
 
+def test_softmaxes_along_the_dimensions_are_the_marginals_of_a_full_grid():
+    made = of_actions(2)
+    weights = jnp.array([[1.5, -0.7], [-2.0, 0.4]])
+
+    def value(weights, observation, action):
+        q = jnp.sum(weights[0] * action + weights[1] * jnp.square(action), axis=-1)
+        return q + observation[..., 0]
+
+    made = made._replace(critic=Network(lambda key: weights, value))
+    hparams = HotStartHParams(critic="softmax")
+    demonstrated = jnp.array([[0.2, -1.0]])
+    loss, _ = hot_start.critic_loss(
+        made, weights, hparams, jnp.zeros((1, 2)), demonstrated, jnp.zeros(1)
+    )
+    # The loss of the marginals of the softmax over all 11 x 11 actions.
+    axis = np.linspace(-1.0, 1.0, 11)
+    actions = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+    full = scipy.special.softmax(value(np.asarray(weights), np.zeros(1), actions))
+    marginals = full.sum(axis=1), full.sum(axis=0)
+    cells = np.eye(11)[6], np.eye(11)[0]
+    expected = [np.sum((p - cell) ** 2) for p, cell in zip(marginals, cells, strict=True)]
+    np.testing.assert_allclose(loss, np.mean(expected), rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_actions_of_a_pair_grow_with_the_dimensions_and_not_as_a_power(kind):
+    evaluated = []
+
+    def value(params, observation, action):
+        evaluated.append(math.prod(action.shape[:-1]))
+        return params * jnp.sum(action, axis=-1)
+
+    for dims in range(1, 9):
+        made = of_actions(dims)
+        made = made._replace(critic=Network(lambda key: jnp.zeros(()), value))
+        batch = random_batch(jax.random.key(0), 32, made.spec)
+        jax.eval_shape(
+            lambda critic, made=made, batch=batch: hot_start.critic_loss(
+                made,
+                critic,
+                HotStartHParams(critic=kind),
+                batch.observation,
+                batch.action,
+                batch.reward,
+            ),
+            jnp.zeros(()),
+        )
+    of_a_pair = [1] * 8 if kind == "monte-carlo" else [11 * dims for dims in range(1, 9)]
+    assert evaluated == [32 * actions for actions in of_a_pair]
+
+
+def test_at_eight_dimensions_the_fitted_critic_prefers_the_demonstrated_action():
+    made = of_actions(8)
+    made = made._replace(critic=networks.critic(made.spec, Architecture(hidden=(16,))))
+    pool = random_batch(jax.random.key(0), 200, made.spec)
+    weights = jax.random.normal(jax.random.key(5), (2, 8))
+    demonstrated = jnp.tanh(jnp.asarray(scaled(pool.observation), jnp.float32) @ weights)
+    data = hot_start.HotStartData(
+        pool._replace(action=demonstrated),
+        jnp.zeros(200),
+        demonstrations.DemonstrationSubset(jnp.array([0]), jnp.array([200])),
+    )
+    params = made.actor.init(jax.random.key(1)), made.critic.init(jax.random.key(2))
+    hparams = HotStartHParams(steps=300, learning_rate=5e-3)
+    _, critic = jax.jit(functools.partial(hot_start.fit, networks=made, hparams=hparams))(
+        jax.random.key(3), params=params, demonstrations=data
+    )
+    best = made.critic.apply(critic, pool.observation, demonstrated)
+    others = jax.random.uniform(jax.random.key(4), (200, 8), minval=-1.0)
+    assert np.mean(best > made.critic.apply(critic, pool.observation, others)) > 0.95
+    # One dimension is moved to the farther bound.
+    for dimension in range(8):
+        far = demonstrated.at[:, dimension].set(-jnp.sign(demonstrated[:, dimension]))
+        assert np.mean(best > made.critic.apply(critic, pool.observation, far)) > 0.9
+
+
 def test_the_large_margin_is_a_hinge_on_how_far_the_demonstrated_action_leads():
     def value(slope, observation, action):
         return slope * action[..., 0] + 0.0 * observation[..., 0]
 
-    networks = SMALL._replace(critic=Network(lambda key: jnp.zeros(()), value))
+    made = SMALL._replace(critic=Network(lambda key: jnp.zeros(()), value))
 
     def loss(slope, margin):
         hparams = HotStartHParams(critic="large-margin", cells=3, margin=margin)
         observation, action = jnp.zeros((2, 2)), jnp.array([[1.0], [0.9]])
-        return hot_start.critic_loss(networks, slope, hparams, observation, action, jnp.zeros(2))[0]
+        return hot_start.critic_loss(made, slope, hparams, observation, action, jnp.zeros(2))[0]
 
     slopes, margins = np.meshgrid([0.0, 0.1, 0.5, 2.0], [0.0, 0.3, 0.8], indexing="ij")
     losses = jax.vmap(loss)(jnp.asarray(slopes.ravel()), jnp.asarray(margins.ravel()))
@@ -83,14 +181,9 @@ def test_the_large_margin_is_a_hinge_on_how_far_the_demonstrated_action_leads():
     np.testing.assert_allclose(losses, expected, atol=1e-6)
 
 
-def test_action_cells_are_the_product_grid_with_both_bounds():
-    spec = PROBE._replace(
-        action_dim=2,
-        action_low=np.array([-1.0, 0.0], np.float32),
-        action_high=np.array([1.0, 2.0], np.float32),
-    )
-    expected = [[a, b] for a in (-1.0, 0.0, 1.0) for b in (0.0, 1.0, 2.0)]
-    np.testing.assert_allclose(hot_start.action_cells(spec, 3), expected)
+def test_action_cells_are_even_along_each_dimension_with_both_bounds(skewed_spec):
+    expected = [[-1.0, 1.0, 3.0], [0.5, 0.75, 1.0]]
+    np.testing.assert_allclose(hot_start.action_cells(skewed_spec, 3), expected)
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,11 @@ def test_values_and_what_is_attained_by_them(tmp_path, capsys):
         ("--actions 0", "--actions: must be at least 2, got 0"),
         ("--discount 1", "--discount: must be at least 0 and below 1, got 1.0"),
         ("--out .", "--out: cannot write to . (Is a directory)"),
+        (
+            "--states 11 2001",
+            "the dynamics [S, A, successors] would be 3.36e+8 numbers (1.25 GiB in float32), "
+            "more than 2^28: take fewer states, actions or subsamples",
+        ),
         ("--starts 0", "--starts: must be at least 1, got 0"),
         ("--env Walker2d-v5", "unknown environment 'Walker2d-v5'; there are: "),
     ],

@@ -79,6 +79,26 @@ def refused(main, tmp_path, capsys):
             "--methods maxent-irl --tabular.centres 1",
             "--tabular.centres: must be at least 2, got 1",
         ),
+        (
+            "--methods maxent-irl --tabular.states 9999",
+            "--tabular: the dynamics [S, A, successors] would be 2.80e+9 numbers "
+            "(10.4 GiB in float32), more than 2^28: take fewer states, actions or subsamples",
+        ),
+        (
+            "--methods ddpg maxent-irl --tabular.centres 99",
+            "--tabular: the reward's features [S, A, F] would be 3.46e+8 numbers "
+            "(1.29 GiB in float32), more than 2^28: take fewer states, actions or centres",
+        ),
+        (
+            "--methods deep-maxent-irl --tabular.hidden 64 99999",
+            "--tabular: the reward's features [S, A, F] would be 1.18e+9 numbers "
+            "(4.38 GiB in float32), more than 2^28: take fewer states, actions or hidden units",
+        ),
+        (
+            "--methods me-ddpg --reward-network.kind radial-basis --reward-network.centres 1999",
+            "--methods me-ddpg: radial basis functions would be 7.67e+8 numbers "
+            "(2.86 GiB in float32), more than 2^28: take fewer centres",
+        ),
         ("--tabular.steps 0", "--tabular.steps: must be at least 1, got 0"),
         (
             "--schedule.frozen-actor-steps -1",

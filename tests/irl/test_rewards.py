@@ -105,6 +105,26 @@ def test_features_need_resolution_and_finite_bounds(spec):
             make(endless, size, "state")
 
 
+def test_features_that_are_a_power_are_refused_before_they_are_made(spec):
+    wide = spec._replace(
+        observation_dim=8,
+        observation_low=np.full(8, -1.0, np.float32),
+        observation_high=np.full(8, 1.0, np.float32),
+    )
+    with pytest.raises(ValueError, match=r"would be 3\.44e\+8 numbers .* take fewer centres"):
+        rewards.radial_basis(wide, 9, "state")
+    with pytest.raises(ValueError, match=r"would be 8\.00e\+8 numbers .* take a lower order"):
+        rewards.fourier(wide, 9, "state")
+    # One pair has 3 x 9 x 9 or 4 x 4 x 4 features: a batch may have too many.
+    batch = [jax.ShapeDtypeStruct((2**22, dim), np.float32) for dim in (2, 1)]
+    with pytest.raises(ValueError, match=r"would be 1\.02e\+9 numbers"):
+        jax.eval_shape(rewards.radial_basis(spec, 9), *batch)
+    fourier = rewards.fourier(spec, 3)
+    assert jax.eval_shape(fourier, *batch).shape == (2**22, 64)
+    with pytest.raises(ValueError, match=r"would be 5\.24e\+8 numbers"):
+        jax.eval_shape(rewards.fourier(spec, 4), *batch)
+
+
 @pytest.mark.parametrize("inputs", ["state-action", "state"])
 @pytest.mark.parametrize("make", [rewards.radial_basis, rewards.fourier])
 def test_features_refuse_other_sizes_and_leading_axes(skewed_spec, make, inputs):

@@ -10,7 +10,8 @@ from tests.support import reference
 
 SPEC = envs.make("MountainCarContinuous-v0").spec
 CENTRE, HALF_WIDTH = np.array([-0.3, 0.0]), np.array([0.9, 0.07])
-SMALL = networks.make(SPEC, Architecture(hidden=(5, 4), output_scale=0.5))
+ARCHITECTURE = Architecture(hidden=(5, 4), output_scale=0.5)
+SMALL = networks.make(SPEC, ARCHITECTURE)
 
 
 def random_batch(key, size, spec=SPEC):

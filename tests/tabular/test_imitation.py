@@ -1,4 +1,5 @@
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.imitation import TabularSettings
-from cmedirl_jax.tabular.interpolation import points
+from cmedirl_jax.tabular.interpolation import Grid, points
 from cmedirl_jax.training import evaluation
 from tests.support import pools
 from tests.support.compiling import jit_as_users
@@ -124,3 +125,30 @@ def test_the_reward_of_twelve_demonstrations_solves_the_task(kind):
     greedy, soft = returns(data)
     assert greedy.min() > 90
     assert soft.min() > 90
+
+
+def test_what_is_a_power_of_the_dimensions_is_refused_before_it_is_made(data):
+    def widened(observations, actions):
+        return pools.ENV.spec._replace(
+            observation_dim=observations,
+            observation_low=np.zeros(observations, np.float32),
+            observation_high=np.ones(observations, np.float32),
+            action_dim=actions,
+            action_low=np.zeros(actions, np.float32),
+            action_high=np.ones(actions, np.float32),
+        )
+
+    # Grids of 41 and 7 points, 9 centres, 64 units.
+    for dims, kind, size in (((3, 1), "linear", "1.06e+9"), ((4, 1), "deep", "1.27e+9")):
+        with pytest.raises(ValueError, match=re.escape(f"[S, A, F] would be {size} numbers")):
+            imitation.check(widened(*dims), kind, TabularSettings())
+        imitation.check(widened(2, 1), kind, TabularSettings())
+    env = pools.ENV._replace(spec=widened(4, 1))
+    with pytest.raises(ValueError, match=re.escape("successors] would be 3.16e+8 numbers")):
+        imitation.discretised(env)
+
+    # 2,959 steps, each shared among 2^8 states and 2^9 actions.
+    states, actions = (Grid((0.0,) * dims, (1.0,) * dims, (2,) * dims) for dims in (8, 9))
+    mdp = discretise.FiniteMDP(None, None, None, states, actions)
+    with pytest.raises(ValueError, match=re.escape("2^A] would be 3.88e+8 numbers")):
+        imitation.visitation(mdp, data, discount=0.9)

@@ -46,6 +46,7 @@ def test_grid_points_interpolate_to_themselves():
         ((0.0,), (np.inf,), (3,), "finite bounds"),
         ((1.0,), (0.0,), (3,), "low must be below its high"),
         ((0.0, 0.0), (1.0, 0.0), (3, 3), "low must be below its high"),
+        ((0.0,) * 8, (1.0,) * 8, (11,) * 8, r"would be 1\.71e\+9 numbers \(6\.39 GiB"),
     ],
 )
 def test_impossible_grids_are_refused(low, high, shape, message):

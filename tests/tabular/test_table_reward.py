@@ -5,6 +5,7 @@ import pytest
 
 from cmedirl_jax.irl import IRLHParams, shaping
 from cmedirl_jax.tabular import discretise, interpolation, table_reward
+from cmedirl_jax.tabular.interpolation import Grid
 from tests.support import pools
 
 STATES, ACTIONS = discretise.grids(pools.ENV.spec, (6, 5), (3,))
@@ -40,6 +41,12 @@ def test_it_learns_nothing():
 def test_a_table_with_a_nan_is_refused():
     with pytest.raises(ValueError, match=r"table must be finite, got nan at \[0, 0\]"):
         table_reward.state(jnp.full((30, 3), jnp.nan), IRLHParams())
+
+
+def test_a_table_is_refused_before_it_is_made():
+    states = Grid((0.0,) * 4, (1.0,) * 4, (41,) * 4)
+    with pytest.raises(ValueError, match=r"a table of rewards would be 9\.69e\+8 numbers"):
+        table_reward.make(states, Grid((0.0,) * 3, (1.0,) * 3, (7,) * 3))
 
 
 def test_a_table_of_zeros_stays_zero():
