@@ -287,7 +287,7 @@ def _update_actor(
             lambda actor: jax.value_and_grad(behaviour_cloning_loss, argnums=1)(
                 parts.networks, actor, state.critic, state.hparams, demonstrations
             ),
-            lambda actor: (jnp.zeros((), jnp.float32), jax.tree.map(jnp.zeros_like, actor)),
+            lambda actor: (jnp.zeros_like(loss), jax.tree.map(jnp.zeros_like, actor)),
             actor,
         )
         loss, grads = jax.tree.map(jnp.add, (loss, grads), (cloning_loss, cloning_grads))
@@ -295,7 +295,8 @@ def _update_actor(
         grads, state.actor_optimizer, actor, learning_rate=state.hparams.actor_learning_rate
     )
     actor = optax.apply_updates(actor, updates)
-    return state.replace(actor=actor, actor_optimizer=optimizer), loss
+    # 32 bits under x64 too, as in the branch that leaves the actor alone.
+    return state.replace(actor=actor, actor_optimizer=optimizer), loss.astype(jnp.float32)
 
 
 def _move_targets(state: DDPGState) -> DDPGState:

@@ -175,7 +175,8 @@ def critic_loss(
     spec = networks.spec
     cells = jnp.asarray(action_cells(spec, hparams.cells))
     half_width = 0.5 * (spec.action_high - spec.action_low)
-    squared_distance = jnp.sum(jnp.square((cells - action[:, None, :]) / half_width), axis=-1)
+    away = cells[None] - action[:, None, :]
+    squared_distance = jnp.sum(jnp.square(away / half_width[None, None]), axis=-1)
     nearest = jax.nn.one_hot(jnp.argmin(squared_distance, axis=-1), len(cells), dtype=jnp.float32)
     actions = jnp.broadcast_to(cells, (*squared_distance.shape, spec.action_dim))
     if hparams.critic in ("one-hot", "large-margin"):

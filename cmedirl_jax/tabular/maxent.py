@@ -168,11 +168,13 @@ def deep_maxent_irl(
     visited, initial = demonstrations
     dynamics_lib.check(dynamics, jnp.shape(visited), initial=initial, absorbing=absorbing)
     checks.kind("visitation", visited, jnp.floating)
+    precision = dynamics_lib.precision(dynamics, visited, initial, discount, temperature)
+    visited, initial = jnp.asarray(visited, precision), jnp.asarray(initial, precision)
     problem = _Problem(
         network=network,
         inputs=inputs,
         dynamics=dynamics,
-        demonstrations=demonstrations,
+        demonstrations=TabularDemonstrations(visited, initial),
         temperature=temperature,
         prior_precision=prior_precision,
         control={"discount": discount, "horizon": horizon, "absorbing": absorbing, "stop": stop},
@@ -244,7 +246,9 @@ def _step(
 
 def _reward(problem: _Problem, params: Params) -> jax.Array:
     """The network's reward of every pair, `[S, A]`."""
-    reward, size = problem.network.apply(params, *problem.inputs), problem.demonstrations[0].shape
+    visited = problem.demonstrations.visitation
+    reward = problem.network.apply(params, *problem.inputs).astype(visited.dtype)
+    size = visited.shape
     if reward.shape == size[:1]:
         reward = reward[:, None]
     elif reward.shape != size:
@@ -300,7 +304,8 @@ def empirical_visitation(
         discount: gamma, per step.
     """
     mask = jnp.asarray(mask)
-    weight = mask * jnp.asarray(discount) ** jnp.arange(mask.shape[1]) / mask.shape[0]
+    discounts = jnp.asarray(discount) ** jnp.arange(mask.shape[1])
+    weight = mask * discounts[None] / mask.shape[0]
     return TabularDemonstrations(
         jnp.zeros(size, weight.dtype).at[state, action].add(weight),
         jnp.zeros(size[0], weight.dtype).at[jnp.asarray(state)[:, 0]].add(1.0 / mask.shape[0]),

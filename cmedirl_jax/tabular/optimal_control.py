@@ -48,6 +48,7 @@ def value_iteration(
     dynamics_lib.check(dynamics, jnp.shape(reward), absorbing=absorbing)
     checks.kind("reward", reward, jnp.floating)
     dynamics_lib.check_horizon(horizon)
+    reward = jnp.asarray(reward, dynamics_lib.precision(dynamics, reward, discount))
 
     def action_values(values: jax.Array) -> jax.Array:
         return reward + discount * dynamics_lib.expected_next(dynamics, values)

@@ -71,6 +71,8 @@ def soft_value_iteration(
     dynamics_lib.check(dynamics, jnp.shape(reward), absorbing=absorbing, guess=guess)
     checks.kind("reward", reward, jnp.floating)
     dynamics_lib.check_horizon(horizon)
+    precision = dynamics_lib.precision(dynamics, reward, discount, temperature)
+    reward = jnp.asarray(reward, precision)
 
     def back_up(values: jax.Array) -> tuple[jax.Array, jax.Array]:
         q = reward + discount * dynamics_lib.expected_next(dynamics, values)
@@ -79,7 +81,7 @@ def soft_value_iteration(
 
     residual = jnp.zeros((), reward.dtype)
     if horizon is None:
-        guess = jnp.zeros_like(reward[:, 0]) if guess is None else guess
+        guess = jnp.zeros_like(reward[:, 0]) if guess is None else jnp.asarray(guess, precision)
         values, residual = fixed_point.solve(lambda v: back_up(v)[0], guess, stop or Stop())
         values, q = back_up(values)
     else:
@@ -131,19 +133,21 @@ def expected_visitation(
         )
     dynamics_lib.check(dynamics, size, initial=initial, absorbing=absorbing, guess=guess)
     probabilities = jnp.exp(policy.log_probabilities)
+    precision = dynamics_lib.precision(dynamics, initial, probabilities, discount)
+    initial = jnp.asarray(initial, precision)
     if absorbing is not None:
         probabilities = jnp.where(jnp.asarray(absorbing)[:, None], 0.0, probabilities)
 
     # Infinite horizon: the discounted visits of each state are a fixed point.
     if horizon is None:
         extend = functools.partial(_extend, dynamics, probabilities, initial, discount)
-        guess = initial if guess is None else guess
+        guess = initial if guess is None else jnp.asarray(guess, precision)
         visits, _ = fixed_point.solve(extend, guess, stop or Stop())
         return visits[:, None] * probabilities
 
     # Finite horizon: forward in time, adding up.
     move = functools.partial(_move, dynamics, discount)
-    carry = (initial, jnp.ones_like(initial[0]), jnp.zeros_like(probabilities[0]))
+    carry = (initial, jnp.ones_like(initial[0]), jnp.zeros_like(probabilities[0], precision))
     (_, _, total), _ = jax.lax.scan(move, carry, probabilities)
     return total
 

@@ -53,6 +53,7 @@ def state(table: jax.Array, hparams: IRLHParams) -> RewardState:
         table: `[states.size, actions.size]`, without a row for the absorbing state.
         hparams: only `bound` is read.
     """
+    table = jnp.asarray(table, jnp.float32)
     largest = jnp.max(jnp.abs(table))
     scaled = hparams.bound * table / jnp.where(largest > 0, largest, 1.0)
     return RewardState(scaled, (), traced(hparams))

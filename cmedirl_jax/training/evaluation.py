@@ -90,7 +90,7 @@ def rollout(
         return states, step.observation, done | step.terminated | step.truncated, result, time + 1
 
     nothing = jnp.zeros(count, bool)
-    result = Rollouts(jnp.zeros(count), jnp.zeros(count, jnp.int32), nothing)
+    result = Rollouts(jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32), nothing)
     carry = (states, observations, nothing, result, jnp.zeros((), jnp.int32))
     return jax.lax.while_loop(running, advance, carry)[3]
 

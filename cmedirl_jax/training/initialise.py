@@ -119,7 +119,8 @@ def _split(key: jax.Array) -> tuple[_Keys, jax.Array]:
 
 
 def _draw_networks(parts: _Parts, key: jax.Array) -> tuple[Params, Params]:
-    state = parts.algorithm.agent.init(_split(key)[0].agent)
+    # A clone: `init` splits the same key.
+    state = parts.algorithm.agent.init(_split(jax.random.clone(key))[0].agent)
     return state.actor, state.critic
 
 
