@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import checks, optimizers
+from cmedirl_jax import checks, modes, optimizers
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.networks import ActorCritic
 from cmedirl_jax.optimizers import traced
@@ -247,7 +247,7 @@ def _update(
     state, policy_loss = _when(
         update_actor,
         lambda state: _update_actor(parts, state, batch, demonstrations, clone),
-        lambda state: (state, jnp.zeros((), jnp.float32)),
+        lambda state: (state, modes.vary(jnp.zeros((), jnp.float32), state, batch, demonstrations)),
         state,
     )
     state = _when(update_targets, _move_targets, lambda state: state, state)

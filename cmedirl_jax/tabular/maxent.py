@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, modes
 from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import soft_control
 from cmedirl_jax.tabular.dynamics import Dynamics
@@ -184,9 +184,9 @@ def deep_maxent_irl(
     # Each step's fixed points start where those of the step before ended.
     params = network.init(key)
     start = (params, problem.optimizer.init(params), jnp.zeros_like(initial), initial)
-    (params, _, values, occupancy), info = jax.lax.scan(
-        functools.partial(_step, problem), start, None, length=steps
-    )
+    step = functools.partial(_step, problem)
+    start = modes.settle(lambda carry: step(carry, None)[0], start)
+    (params, _, values, occupancy), info = jax.lax.scan(step, start, None, length=steps)
     reward = _reward(problem, params)
     policy = _soft_policy(problem, reward, values)
     return MaxEntResult(params, reward, policy, _visitation(problem, policy, occupancy), info)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, modes
 from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import fixed_point
 from cmedirl_jax.tabular.dynamics import Dynamics
@@ -57,7 +57,7 @@ def value_iteration(
         best = jnp.max(action_values(values), axis=-1)
         return best if absorbing is None else jnp.where(absorbing, 0.0, best)
 
-    last = jnp.zeros_like(reward[:, 0])
+    last = modes.settle(back_up, jnp.zeros_like(reward[:, 0]))
     if horizon is None:
         values, residual = fixed_point.iterate(back_up, last, stop or Stop())
         return OptimalPolicy(values, action_values(values), residual)

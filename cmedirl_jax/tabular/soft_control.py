@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, modes
 from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import fixed_point
 from cmedirl_jax.tabular.dynamics import Dynamics
@@ -90,7 +90,7 @@ def soft_value_iteration(
             values, q = back_up(values)
             return values, (values, q)
 
-        last = jnp.zeros_like(reward[:, 0])
+        last = modes.settle(lambda values: back_up(values)[0], jnp.zeros_like(reward[:, 0]))
         _, (values, q) = jax.lax.scan(body, last, None, length=horizon, reverse=True)
     return SoftPolicy(jax.nn.log_softmax(q / temperature, axis=-1), q, values, residual)
 
@@ -148,6 +148,7 @@ def expected_visitation(
     # Finite horizon: forward in time, adding up.
     move = functools.partial(_move, dynamics, discount)
     carry = (initial, jnp.ones_like(initial[0]), jnp.zeros_like(probabilities[0], precision))
+    carry = modes.settle(lambda carry, step: move(carry, step)[0], carry, probabilities[0])
     (_, _, total), _ = jax.lax.scan(move, carry, probabilities)
     return total
 

@@ -8,6 +8,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import modes
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.agents.ddpg import DDPGState
 from cmedirl_jax.agents.hot_start import HotStartData
@@ -153,7 +154,7 @@ def _init(
 
     # The first episode.
     env_state, observation = parts.env.reset(keys.env, parts.env_params)
-    return TrainingState(
+    state = TrainingState(
         key=steps_key,
         agent=algorithm.agent.init(keys.agent, networks),
         reward=reward,
@@ -167,6 +168,7 @@ def _init(
         episode_length=jnp.zeros((), jnp.int32),
         subset=subset,
     )
+    return modes.vary(state, key)
 
 
 def _learn_beforehand(
