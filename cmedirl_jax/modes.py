@@ -1,6 +1,6 @@
-"""What JAX's strict modes ask of arrays: equal ranks, and equal axes of variation in `shard_map`."""
+"""What strict modes of JAX ask of arrays: equal ranks, and to vary alike within `shard_map`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import jax
@@ -23,30 +23,36 @@ def align(*arrays: Array) -> list[jax.Array]:
 def vary(tree: Tree, *like: Any) -> Tree:
     """Mark arrays as varying over the mesh axes over which the leaves of `like` vary.
 
-    A branch of `lax.cond`, or the start of a loop, that is a constant has to be marked so within a
-    caller's `shard_map`. Elsewhere this returns `tree`.
+    A caller's `shard_map` asks that of a branch's result, or of a loop's start, that is constant.
+    Elsewhere `tree` is returned as it is.
     """
-    if not jax.sharding.get_abstract_mesh().manual_axes:
-        return tree
-    axes = frozenset().union(*map(_axes, jax.tree.leaves(like)))
+    return _vary(tree, map(jax.typeof, jax.tree.leaves(like))) if _in_shard_map() else tree
+
+
+def settle(body: Callable[..., Tree], start: Tree, *inputs: Any) -> Tree:
+    """The start of a loop, marked as varying as much as `body(start, *inputs)` does.
+
+    Within `shard_map` this traces `body`, which may close over what varies.
+    """
+    if not _in_shard_map():
+        return start
+    after = jax.make_jaxpr(body)(start, *inputs).out_avals
+    return _vary(start, [*map(jax.typeof, jax.tree.leaves(start)), *after])
+
+
+def _in_shard_map() -> bool:
+    return bool(jax.sharding.get_abstract_mesh().manual_axes)
+
+
+def _vary(tree: Tree, kinds: Iterable[Any]) -> Tree:
+    axes = frozenset().union(*map(_axes, kinds))
 
     def mark(leaf: Any) -> jax.Array:
-        return jax.lax.pcast(leaf, tuple(axes - _axes(leaf)), to="varying")
+        return jax.lax.pcast(leaf, tuple(axes - _axes(jax.typeof(leaf))), to="varying")
 
     return jax.tree.map(mark, tree)
 
 
-def settle(body: Callable[..., Tree], start: Tree, *inputs: Any) -> Tree:
-    """`start` of a loop as `vary` marks it, so that `body(start, *inputs)` varies no more than it.
-
-    What varies may be closed over by `body`, which is therefore traced, within `shard_map` alone.
-    """
-    if not jax.sharding.get_abstract_mesh().manual_axes:
-        return start
-    return vary(start, start, jax.make_jaxpr(body)(start, *inputs).out_avals)
-
-
-def _axes(leaf: Any) -> frozenset:
-    kind = leaf if isinstance(leaf, jax.core.AbstractValue) else jax.typeof(leaf)
-    # Its name in JAX up to 0.10.1 and since.
+def _axes(kind: Any) -> frozenset[str]:
+    """The mesh axes over which an array of this type varies; `vma` is their earlier name."""
     return kind.vma if hasattr(kind, "vma") else kind.manual_axis_type.varying

@@ -139,7 +139,7 @@ def step_groups(
             return put(states, stepped, index), put(outputs, output, index)
 
         outputs = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes[1])
-        outputs = modes.vary(outputs, jaxpr.out_avals)
+        outputs = modes.vary(outputs, states, shared)
         return jax.lax.fori_loop(0, groups, body, (states, outputs))
 
     return mapped
