@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks, ranges
+from cmedirl_jax import checks, modes, ranges
 from cmedirl_jax.ranges import Count, NotNegative, Size
 from cmedirl_jax.types import EnvSpec, Network, Params
 
@@ -193,7 +193,12 @@ def squashing(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
     checks.env_spec(spec)
     centre = jnp.asarray(0.5 * (spec.action_high + spec.action_low))
     half_width = jnp.asarray(0.5 * (spec.action_high - spec.action_low))
-    return lambda pre_activation: centre + half_width * jnp.tanh(pre_activation)
+    return functools.partial(_squash, centre, half_width)
+
+
+def _squash(centre: jax.Array, half_width: jax.Array, pre_activation: jax.Array) -> jax.Array:
+    pre_activation, centre, half_width = modes.align(pre_activation, centre, half_width)
+    return centre + half_width * jnp.tanh(pre_activation)
 
 
 def observation_scaling(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
@@ -217,7 +222,8 @@ def observation_scaling(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
 
 def _scale(centre: np.ndarray, half_width: np.ndarray, observation: jax.Array) -> jax.Array:
     checks.vectors("observation", observation, len(centre))
-    return (observation - centre) / half_width
+    aligned, middle, scale = modes.align(observation, centre, half_width)
+    return (aligned - middle) / scale
 
 
 def from_module(apply: Callable[..., Any], init: Callable[[jax.Array], Params]) -> Network:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import checks, optimizers, ranges
+from cmedirl_jax import checks, modes, optimizers, ranges
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.networks import ActorCritic
 from cmedirl_jax.optimizers import traced
@@ -249,7 +249,7 @@ def _update(
     state, policy_loss = _when(
         update_actor,
         lambda state: _update_actor(parts, state, batch, demonstrations, clone),
-        lambda state: (state, jnp.zeros((), jnp.float32)),
+        lambda state: (state, modes.vary(jnp.zeros((), jnp.float32), state, batch, demonstrations)),
         state,
     )
     state = _when(update_targets, _move_targets, lambda state: state, state)
@@ -289,7 +289,7 @@ def _update_actor(
             lambda actor: jax.value_and_grad(behaviour_cloning_loss, argnums=1)(
                 parts.networks, actor, state.critic, state.hparams, demonstrations
             ),
-            lambda actor: (jnp.zeros((), jnp.float32), jax.tree.map(jnp.zeros_like, actor)),
+            lambda actor: (jnp.zeros_like(loss), jax.tree.map(jnp.zeros_like, actor)),
             actor,
         )
         loss, grads = jax.tree.map(jnp.add, (loss, grads), (cloning_loss, cloning_grads))
@@ -297,7 +297,8 @@ def _update_actor(
         grads, state.actor_optimizer, actor, learning_rate=state.hparams.actor_learning_rate
     )
     actor = optax.apply_updates(actor, updates)
-    return state.replace(actor=actor, actor_optimizer=optimizer), loss
+    # 32 bits under x64 too, as in the branch that leaves the actor alone.
+    return state.replace(actor=actor, actor_optimizer=optimizer), loss.astype(jnp.float32)
 
 
 def _move_targets(state: DDPGState) -> DDPGState:

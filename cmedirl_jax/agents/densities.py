@@ -10,6 +10,7 @@ All functions return logarithms; -inf is a density of zero. Shapes: observations
 `[..., A]`, densities `[...]`.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmedirl_jax import modes
 from cmedirl_jax.types import Array, EnvSpec, Numeric
 
 SCALE_FLOOR = 1e-2
@@ -44,7 +46,9 @@ def clipped_normal(spec: EnvSpec, mean: Array, scale: Array, action: Array) -> j
         scale: standard deviations, `[..., A]`, in units of the action.
         action: `[..., A]`, inside the bounds or on them.
     """
-    low, high = spec.action_low, spec.action_high
+    low, high, mean, scale, action = modes.align(
+        spec.action_low, spec.action_high, mean, scale, action
+    )
     inside = -0.5 * jnp.square((action - mean) / scale) - jnp.log(scale * math.sqrt(2 * math.pi))
     at_low = jax.scipy.stats.norm.logcdf((low - mean) / scale)
     at_high = jax.scipy.stats.norm.logcdf((mean - high) / scale)
@@ -74,9 +78,10 @@ def epsilon_greedy(
             units of the action; None: no noise.
     """
     uniform = jnp.log(epsilon) - log_volume(spec)
+    greedy, action, low, high = modes.align(greedy, action, spec.action_low, spec.action_high)
     if noise is None:
         return jnp.where(jnp.all(action == greedy, axis=-1), jnp.inf, uniform)
-    inside = jnp.all((action > spec.action_low) & (action < spec.action_high), axis=-1)
+    inside = jnp.all((action > low) & (action < high), axis=-1)
     return jnp.logaddexp(
         jnp.where(inside, uniform, -jnp.inf),
         jnp.log1p(-epsilon) + clipped_normal(spec, greedy, noise, action),
@@ -119,7 +124,7 @@ def trajectory_mixture(
     Returns:
         `[...]`.
     """
-    taken = jnp.where(steps, log_densities, 0.0)
+    taken = jnp.where(steps[None], log_densities, 0.0)
     # A policy that never takes one of the actions has density 0, whatever atoms the others have.
     impossible = jnp.any(taken == -jnp.inf, axis=-1)
     total = jnp.sum(jnp.where(impossible[..., None], 0.0, taken), axis=-1)
@@ -142,8 +147,9 @@ def fit_gaussian(
         weight: `[N]`, of each pair, not all zero; default equal.
     """
     weight = jnp.ones(len(observation), jnp.float32) if weight is None else weight
-    mean, action_mean = (jnp.average(x, 0, weight) for x in (observation, action))
-    spread = jnp.sqrt(jnp.average(jnp.square(observation - mean), 0, weight))
+    average = functools.partial(jnp.average, axis=0, weights=weight, keepdims=True)
+    mean, action_mean = average(observation), average(action)
+    spread = jnp.sqrt(average(jnp.square(observation - mean)))
     # Constant features carry only rounding error: do not rescale them.
     spread = jnp.where(spread > 1e-6 * jnp.abs(mean), spread, jnp.inf)
     standard = (observation - mean) / spread
@@ -157,11 +163,11 @@ def fit_gaussian(
         maxiter=4 * standard.shape[1],
     )
     residual = action - action_mean - standard @ slopes
-    slopes = slopes / spread[:, None]
+    slopes = slopes / spread.T
     floor = 0.5 * SCALE_FLOOR * (spec.action_high - spec.action_low)
     return ConditionalGaussian(
-        jnp.concatenate([(action_mean - mean @ slopes)[None], slopes]),
-        jnp.maximum(jnp.sqrt(jnp.average(jnp.square(residual), 0, weight)), floor),
+        jnp.concatenate([action_mean - (mean[0] @ slopes)[None], slopes]),
+        jnp.maximum(jnp.sqrt(average(jnp.square(residual))[0]), floor),
     )
 
 
@@ -178,5 +184,5 @@ def gaussian_policy(
         observation: `[..., O]`.
         action: `[..., A]`.
     """
-    mean = fitted.coefficients[0] + observation @ fitted.coefficients[1:]
-    return clipped_normal(spec, mean, fitted.scale, action)
+    intercept, slope = modes.align(fitted.coefficients[0], observation @ fitted.coefficients[1:])
+    return clipped_normal(spec, intercept + slope, fitted.scale, action)

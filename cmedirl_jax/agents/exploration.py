@@ -338,7 +338,8 @@ def _perturb_epsilon_greedy(
         densities.epsilon_greedy(spec, epsilon, action, chosen, scale),
     )
     remaining = jnp.where(begins, state.hparams.hold - 1.0, state.remaining - 1.0)
-    state = state.replace(action=chosen, remaining=jnp.maximum(remaining, 0.0))
+    held = chosen.astype(state.action.dtype)
+    state = state.replace(action=held, remaining=jnp.maximum(remaining, 0.0))
     return chosen, log_density, state
 
 

@@ -115,5 +115,5 @@ def _take(
     age = (bits % jnp.maximum(held, 1).astype(jnp.uint32)).astype(jnp.int32)
     slot = (state.count - 1 - age) % capacity
     start, length = state.start[slot, None], state.length[slot, None]
-    time = jnp.arange(max_length, dtype=jnp.int32)
+    time = jnp.arange(max_length, dtype=jnp.int32)[None]
     return (start + time) % replay_capacity, (time < length) & (held > 0)

@@ -153,13 +153,14 @@ def pack(spec: EnvSpec, transition: Transition) -> jax.Array:
         TypeError: if a leaf is not of floats, or `terminated` is not bool.
     """
     checks.transition_shapes(spec, transition, jnp.shape(transition.reward), "transition")
+    whole = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), transition)
     return jnp.concatenate(
         [
-            transition.observation,
-            transition.action,
-            jnp.asarray(transition.reward)[..., None],
-            transition.next_observation,
-            jnp.asarray(transition.terminated, jnp.float32)[..., None],
+            whole.observation,
+            whole.action,
+            whole.reward[..., None],
+            whole.next_observation,
+            whole.terminated[..., None],
         ],
         axis=-1,
     )

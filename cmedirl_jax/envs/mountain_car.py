@@ -99,7 +99,8 @@ def step(
 ) -> tuple[MountainCarState, Step]:
     """Advance the car by `action` `[1]`. It is deterministic and does not use `key`."""
     del key
-    force = jnp.clip(action[0], SPEC.action_low[0], SPEC.action_high[0])
+    push = jnp.asarray(action[0], jnp.float32)
+    force = jnp.clip(push, SPEC.action_low[0], SPEC.action_high[0])
     velocity = state.velocity + (
         force * params.power - params.gravity * jnp.cos(3.0 * state.position)
     )
@@ -107,7 +108,7 @@ def step(
     position = jnp.clip(state.position + velocity, params.min_position, params.max_position)
     velocity = jnp.where((position == params.min_position) & (velocity < 0), 0.0, velocity)
     terminated = (position >= params.goal_position) & (velocity >= params.goal_velocity)
-    reward = params.goal_reward * terminated - params.action_cost * jnp.square(action[0])
+    reward = params.goal_reward * terminated - params.action_cost * jnp.square(push)
     new_state = MountainCarState(position, velocity, state.time + 1)
     truncated = new_state.time >= params.max_episode_steps
     return new_state, Step(_observe(new_state), reward, terminated, truncated)
@@ -116,6 +117,7 @@ def step(
 def state_at(observation: jax.Array, params: MountainCarParams) -> MountainCarState:
     """The car at `observation` `[2]`, before its first step."""
     del params
+    observation = jnp.asarray(observation, jnp.float32)
     return MountainCarState(observation[0], observation[1], jnp.zeros((), jnp.int32))
 
 

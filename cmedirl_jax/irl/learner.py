@@ -210,7 +210,7 @@ def _update(
     )
     if hparams.gauge != "none":
         target = regularisers.gauge_offset(hparams.gauge, *scored)
-        offset = offset + hparams.gauge_rate * (target - offset)
+        offset += (hparams.gauge_rate * (target - offset)).astype(offset.dtype)
     network, absorbing = cast(Any, optax.apply_updates(learned, updates))
     params = RewardParams(network, offset, absorbing)
     return state.replace(params=params, optimizer=optimizer_state), info

@@ -24,6 +24,7 @@ from typing import Literal, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import modes
 from cmedirl_jax.irl.regularisers import masked_mean
 from cmedirl_jax.registries import Registry
 from cmedirl_jax.types import Numeric, RewardBatch
@@ -177,7 +178,7 @@ def score_trajectories(
 def returns(reward: jax.Array, mask: jax.Array, discount: Numeric = 1.0) -> jax.Array:
     """R(tau) = sum_t discount^t r_t over the steps of `mask`: `[..., T]` -> `[...]`."""
     steps = jnp.arange(reward.shape[-1])
-    weight = jnp.asarray(discount**steps, reward.dtype)
+    weight, reward = modes.align(jnp.asarray(discount**steps, reward.dtype), reward)
     return jnp.sum(jnp.where(mask, weight * reward, 0.0), axis=-1)
 
 

@@ -49,7 +49,7 @@ def gradient_penalty(
     """
     by_pair = jax.vmap(jax.grad(function, argnums=(0, 1)))(observation, action)
     squared = sum(
-        jnp.sum(jnp.square(slope * unit), axis=-1)
+        jnp.sum(jnp.square(slope * unit[None]), axis=-1)
         for slope, unit in zip(by_pair, scale, strict=True)
     )
     # The square root has no derivative at zero.

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks, grids, networks
+from cmedirl_jax import checks, grids, modes, networks
 from cmedirl_jax.ranges import AtLeastTwo, Size
 from cmedirl_jax.registries import Registry
 from cmedirl_jax.types import Array, EnvSpec, Network, Params
@@ -175,7 +175,8 @@ def _radial_basis(
     checks.pairs(spec, observation, None if inputs == "state" else action)
     size = (*observation.shape[:-1], len(grid), 1 if inputs == "state" else 1 + 2 * spec.action_dim)
     checks.array_size("radial basis functions", size, _FEWER_CENTRES)
-    away = (scale(jnp.asarray(observation))[..., None, :] - grid) / width
+    position, centres = modes.align(scale(jnp.asarray(observation))[..., None, :], grid)
+    away = (position - centres) / width
     local = jax.nn.softmax(-0.5 * jnp.sum(jnp.square(away), axis=-1), axis=-1)
     if inputs == "state":
         return local
@@ -223,8 +224,9 @@ def _fourier(
         observation = jnp.concatenate([observation, action], axis=-1)
     size = (*observation.shape[:-1], len(frequencies))
     checks.array_size("a Fourier basis", size, _LOWER_ORDER)
-    x = (observation - low) / (high - low)
-    return jnp.cos(jnp.sum(x[..., None, :] * frequencies, axis=-1))
+    position, least, width = modes.align(observation, low, high - low)
+    x, c = modes.align(((position - least) / width)[..., None, :], frequencies)
+    return jnp.cos(jnp.sum(x * c, axis=-1))
 
 
 NETWORKS: Registry[NetworkKind] = Registry(

@@ -146,8 +146,8 @@ def trajectories(
 def _demonstrated_trajectories(
     pool: Transition, subset: DemonstrationSubset, chosen: jax.Array, *, max_length: int
 ) -> Samples:
-    time = jnp.arange(max_length, dtype=jnp.int32)
-    start, length = (leaf[chosen, None] for leaf in subset)
+    time = jnp.arange(max_length, dtype=jnp.int32)[None]
+    start, length = (jnp.asarray(leaf)[chosen, None] for leaf in subset)
     # Rows past the pool's end are masked, but must be rows.
     rows = jnp.minimum(start + time, jnp.shape(pool.reward)[0] - 1)
     return Samples(demonstrations_lib.at(pool, rows), time < length, None)

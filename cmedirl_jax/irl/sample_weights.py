@@ -105,7 +105,8 @@ def _record_density(
     replay_capacity: int,
 ) -> RecordedState:
     del actor
-    return state.replace(log_density=state.log_density.at[step % replay_capacity].set(log_density))
+    kept, density = state.log_density, jnp.asarray(log_density, jnp.float32)
+    return state.replace(log_density=kept.at[step % replay_capacity].set(density))
 
 
 def _recorded_density(

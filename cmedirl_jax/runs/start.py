@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 
+from cmedirl_jax.runs import numerics
 from cmedirl_jax.runs.cluster import processes
 from cmedirl_jax.runs.cluster.base import Cluster, ClusterOptions
 from cmedirl_jax.runs.errors import UserError
@@ -27,7 +28,7 @@ def start(
         options: which processes share the run.
         count: devices of each process; None: every core or GPU that is of use.
         seeds: how many seeds share the devices.
-        same: options that must be equal on all processes, JSON values.
+        same: options that must be equal on all processes, JSON values; so must `numerics` be.
 
     Returns:
         The processes, and the devices of all of them.
@@ -51,7 +52,7 @@ def start(
     if cluster.any(refused):
         there = f"there are {available}" if refused else "another process has fewer"
         raise UserError(f"--devices: {count} asked, {there}")
-    cluster.check_same(same)
+    cluster.check_same(same | numerics.current())
     return cluster, cluster.devices(None if count is None else max(count, 1), seeds)
 
 

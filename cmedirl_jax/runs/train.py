@@ -12,6 +12,7 @@ from rich.console import Console
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.runs import numerics
 from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells import experts, gymnasium_replay, tabular_cell
@@ -229,6 +230,7 @@ def _train_cell(
             "task": plain.plain(plan.env.spec),
             "settings": plain.plain(plan.settings),
             "versions": run_folder.versions(),
+            "numerics": numerics.current(),
         }
         trees = {"policies": result.best, "rewards": result.reward}
         cells.save(plan.folder, key, description, rows, trees, session.cluster.call)

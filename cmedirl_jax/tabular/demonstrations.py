@@ -71,7 +71,8 @@ def empirical_visitation(
     checks.shares(discount=discount)
     _check_steps(Steps(state, action, mask), size)
     n, length = jnp.shape(mask)
-    weight = jnp.asarray(mask) * jnp.asarray(discount) ** jnp.arange(length) / n
+    discounts = jnp.asarray(discount) ** jnp.arange(length)
+    weight = jnp.asarray(mask) * discounts[None] / n
     return TabularDemonstrations(
         jnp.zeros(size, weight.dtype).at[state, action].add(weight),
         jnp.zeros(size[0], weight.dtype).at[jnp.asarray(state)[:, 0]].add(1.0 / n),

@@ -119,7 +119,7 @@ def _successors(
         point: `[O]`.
         action: `[A]`.
     """
-    around = point + offsets.astype(np.float32) * states.spacing.astype(np.float32)
+    around = point[None] + offsets.astype(np.float32) * states.spacing.astype(np.float32)
     answer = jax.vmap(functools.partial(_step_from, env, params), in_axes=(0, None))(around, action)
     index, weight = interpolation.interpolate(states, answer.observation)
     index = jnp.where(answer.terminated[:, None], states.size, index)

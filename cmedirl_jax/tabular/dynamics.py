@@ -29,6 +29,15 @@ Dynamics = Array | SparseDynamics
 """P(s' | s, a): dense `[S, A, S]`, or sparse."""
 
 
+def precision(dynamics: Dynamics, *numbers: Array | Numeric) -> jnp.dtype:
+    """The type that a problem is solved in: the widest of its dynamics and its other numbers.
+
+    Under `jax_enable_x64` a program may give one in 32 bits and another in 64.
+    """
+    probability = dynamics.probability if isinstance(dynamics, SparseDynamics) else dynamics
+    return jnp.result_type(probability, *numbers)
+
+
 def expected_next(dynamics: Dynamics, values: jax.Array) -> jax.Array:
     """sum_s' P(s'|s,a) V(s'): `[S]` -> `[S, A]`."""
     if isinstance(dynamics, SparseDynamics):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import checks, ranges
+from cmedirl_jax import checks, modes, ranges
 from cmedirl_jax.types import Numeric
 
 
@@ -47,7 +47,7 @@ def iterate(
         return after, change, count + 1
 
     start = (guess, jnp.full((), jnp.inf, guess.dtype), jnp.zeros((), jnp.int32))
-    point, change, _ = jax.lax.while_loop(going, advance, start)
+    point, change, _ = jax.lax.while_loop(going, advance, modes.settle(advance, start))
     return point, change
 
 
@@ -65,7 +65,7 @@ def solve(
 
     return jax.lax.custom_root(
         lambda x: x - function(x),
-        guess,
+        modes.settle(function, guess),
         lambda _, guess: iterate(function, guess, stop),
         tangent,
         has_aux=True,

@@ -231,14 +231,15 @@ def visitation(
     pool = jax.tree.map(jnp.asarray, data.episodes)
     chosen = pool if subset is None else subset
     drawn = jnp.searchsorted(pool.start, chosen.start)
-    share = jnp.where(chosen.length > 0, 1.0, 0.0) / jnp.sum(chosen.length > 0)
-    weight = jnp.zeros(pool.start.shape).at[drawn].add(share)
+    there = (chosen.length > 0).astype(mdp.reward.dtype)
+    weight = jnp.zeros(pool.start.shape, there.dtype).at[drawn].add(there / jnp.sum(there))
     row = jnp.arange(data.transition.reward.shape[0])
     episode = jnp.searchsorted(pool.start, row, side="right") - 1
     time = row - pool.start[episode]
     state, state_weight = interpolation.interpolate(mdp.states, data.transition.observation)
     action, action_weight = interpolation.interpolate(mdp.actions, data.transition.action)
-    visits = (weight[episode] * discount**time)[:, None] * state_weight  # [N, 2^O]
+    discounts = jnp.asarray(discount**time, weight.dtype)
+    visits = (weight[episode] * discounts)[:, None] * state_weight  # [N, 2^O]
     both = visits[:, :, None] * action_weight[:, None, :]
     starts = jnp.where(time == 0, weight[episode], 0.0)[:, None] * state_weight
     empty = jnp.zeros_like(mdp.reward)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks, grids
+from cmedirl_jax import checks, grids, modes
 from cmedirl_jax.types import Array
 
 
@@ -73,16 +73,20 @@ def interpolate(grid: Grid, position: Array) -> tuple[jax.Array, jax.Array]:
     Returns:
         Indices into `points(grid)` `[..., 2^D]` int32, and weights that sum to one.
     """
-    shape = np.array(grid.shape)
-    steps = (jnp.asarray(position) - np.array(grid.low, np.float32)) / grid.spacing.astype(
-        np.float32
+    position, low, spacing, last = modes.align(
+        jnp.asarray(position),
+        np.array(grid.low, np.float32),
+        grid.spacing.astype(np.float32),
+        np.array(grid.shape, np.int32) - 1,
     )
-    steps = jnp.clip(steps, 0.0, (shape - 1).astype(np.float32))
-    below = jnp.minimum(steps.astype(jnp.int32), shape - 2)
-    fraction = steps - below
-    corners = grids.product(*[np.arange(2)] * len(shape))  # [2^D, D]
+    steps = jnp.clip((position - low) / spacing, 0.0, last.astype(jnp.float32))
+    below = jnp.minimum(steps.astype(jnp.int32), last - 1)
+    corners = grids.product(*[np.arange(2, dtype=np.int32)] * len(grid.shape))  # [2^D, D]
+    below, fraction, corners = modes.align(
+        below[..., None, :], (steps - below)[..., None, :], corners
+    )
     index = jnp.ravel_multi_index(
-        tuple(jnp.moveaxis(below[..., None, :] + corners, -1, 0)), grid.shape, mode="clip"
+        tuple(jnp.moveaxis(below + corners, -1, 0)), grid.shape, mode="clip"
     )
-    weight = jnp.where(corners, fraction[..., None, :], 1.0 - fraction[..., None, :])
+    weight = jnp.where(corners, fraction, 1.0 - fraction)
     return index.astype(jnp.int32), jnp.prod(weight, axis=-1)

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import checks, ranges
+from cmedirl_jax import checks, modes, ranges
 from cmedirl_jax.tabular import demonstrations as demonstrations_lib
 from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import soft_control
@@ -165,17 +165,19 @@ def deep_maxent_irl(
     checks.sizes(steps=steps)
     checks.within(ranges.NOT_NEGATIVE, prior_precision=prior_precision)
     checks.within(ranges.FINITE, **{f"inputs[{i}]": array for i, array in enumerate(inputs)})
-    initial, size = demonstrations.initial, jnp.shape(demonstrations.visitation)
-    dynamics_lib.check(dynamics, size, initial=initial, absorbing=absorbing)
+    visited, initial, _ = demonstrations
+    dynamics_lib.check(dynamics, jnp.shape(visited), initial=initial, absorbing=absorbing)
     dynamics_lib.check_control(discount, horizon, temperature)
     demonstrations_lib.check(
         demonstrations, dynamics, discount=discount, horizon=horizon, absorbing=absorbing
     )
+    precision = dynamics_lib.precision(dynamics, visited, initial, discount, temperature)
+    visited, initial = jnp.asarray(visited, precision), jnp.asarray(initial, precision)
     problem = _Problem(
         network=network,
         inputs=inputs,
         dynamics=dynamics,
-        demonstrations=demonstrations,
+        demonstrations=demonstrations._replace(visitation=visited, initial=initial),
         temperature=temperature,
         prior_precision=prior_precision,
         control={"discount": discount, "horizon": horizon, "absorbing": absorbing, "stop": stop},
@@ -185,9 +187,9 @@ def deep_maxent_irl(
     # Each step's fixed points start where those of the step before ended.
     params = network.init(key)
     start = (params, problem.optimizer.init(params), jnp.zeros_like(initial), initial)
-    (params, _, values, occupancy), info = jax.lax.scan(
-        functools.partial(_step, problem), start, None, length=steps
-    )
+    step = functools.partial(_step, problem)
+    start = modes.settle(lambda carry: step(carry, None)[0], start)
+    (params, _, values, occupancy), info = jax.lax.scan(step, start, None, length=steps)
     reward = _reward(problem, params)
     policy = _soft_policy(problem, reward, values)
     return MaxEntResult(params, reward, policy, _visitation(problem, policy, occupancy), info)
@@ -247,7 +249,9 @@ def _step(
 
 def _reward(problem: _Problem, params: Params) -> jax.Array:
     """The network's reward of every pair, `[S, A]`."""
-    reward, size = problem.network.apply(params, *problem.inputs), problem.demonstrations[0].shape
+    visited = problem.demonstrations.visitation
+    reward = problem.network.apply(params, *problem.inputs).astype(visited.dtype)
+    size = visited.shape
     if reward.shape == size[:1]:
         reward = reward[:, None]
     elif reward.shape != size:

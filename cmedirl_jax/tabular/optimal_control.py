@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import modes
 from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import fixed_point
 from cmedirl_jax.tabular.dynamics import Dynamics
@@ -48,6 +49,7 @@ def value_iteration(
     dynamics_lib.check(dynamics, jnp.shape(reward), absorbing=absorbing)
     dynamics_lib.check_reward(reward)
     dynamics_lib.check_control(discount, horizon)
+    reward = jnp.asarray(reward, dynamics_lib.precision(dynamics, reward, discount))
 
     def action_values(values: jax.Array) -> jax.Array:
         return reward + discount * dynamics_lib.expected_next(dynamics, values)
@@ -56,7 +58,7 @@ def value_iteration(
         best = jnp.max(action_values(values), axis=-1)
         return best if absorbing is None else jnp.where(absorbing, 0.0, best)
 
-    last = jnp.zeros_like(reward[:, 0])
+    last = modes.settle(back_up, jnp.zeros_like(reward[:, 0]))
     if horizon is None:
         values, residual = fixed_point.iterate(back_up, last, stop or Stop())
         return OptimalPolicy(values, action_values(values), residual)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import modes
 from cmedirl_jax.tabular import dynamics as dynamics_lib
 from cmedirl_jax.tabular import fixed_point
 from cmedirl_jax.tabular.dynamics import Dynamics
@@ -71,6 +72,8 @@ def soft_value_iteration(
     dynamics_lib.check(dynamics, jnp.shape(reward), absorbing=absorbing, guess=guess)
     dynamics_lib.check_reward(reward)
     dynamics_lib.check_control(discount, horizon, temperature)
+    precision = dynamics_lib.precision(dynamics, reward, discount, temperature)
+    reward = jnp.asarray(reward, precision)
 
     def back_up(values: jax.Array) -> tuple[jax.Array, jax.Array]:
         q = reward + discount * dynamics_lib.expected_next(dynamics, values)
@@ -79,7 +82,7 @@ def soft_value_iteration(
 
     residual = jnp.zeros((), reward.dtype)
     if horizon is None:
-        guess = jnp.zeros_like(reward[:, 0]) if guess is None else guess
+        guess = jnp.zeros_like(reward[:, 0]) if guess is None else jnp.asarray(guess, precision)
         values, residual = fixed_point.solve(lambda v: back_up(v)[0], guess, stop or Stop())
         values, q = back_up(values)
     else:
@@ -88,7 +91,7 @@ def soft_value_iteration(
             values, q = back_up(values)
             return values, (values, q)
 
-        last = jnp.zeros_like(reward[:, 0])
+        last = modes.settle(lambda values: back_up(values)[0], jnp.zeros_like(reward[:, 0]))
         _, (values, q) = jax.lax.scan(body, last, None, length=horizon, reverse=True)
     return SoftPolicy(jax.nn.log_softmax(q / temperature, axis=-1), q, values, residual)
 
@@ -133,19 +136,22 @@ def expected_visitation(
         )
     dynamics_lib.check(dynamics, size, initial=initial, absorbing=absorbing, guess=guess)
     probabilities = jnp.exp(policy.log_probabilities)
+    precision = dynamics_lib.precision(dynamics, initial, probabilities, discount)
+    initial = jnp.asarray(initial, precision)
     if absorbing is not None:
         probabilities = jnp.where(jnp.asarray(absorbing)[:, None], 0.0, probabilities)
 
     # Infinite horizon: the discounted visits of each state are a fixed point.
     if horizon is None:
         extend = functools.partial(_extend, dynamics, probabilities, initial, discount)
-        guess = initial if guess is None else guess
+        guess = initial if guess is None else jnp.asarray(guess, precision)
         visits, _ = fixed_point.solve(extend, guess, stop or Stop())
         return visits[:, None] * probabilities
 
     # Finite horizon: forward in time, adding up.
     move = functools.partial(_move, dynamics, discount)
-    carry = (initial, jnp.ones_like(initial[0]), jnp.zeros_like(probabilities[0]))
+    carry = (initial, jnp.ones_like(initial[0]), jnp.zeros_like(probabilities[0], precision))
+    carry = modes.settle(lambda carry, step: move(carry, step)[0], carry, probabilities[0])
     (_, _, total), _ = jax.lax.scan(move, carry, probabilities)
     return total
 

@@ -65,6 +65,7 @@ def state(table: jax.Array, hparams: IRLHParams) -> RewardState:
     checks.kind("table", table, jnp.floating)
     checks.within(ranges.FINITE, table=table)
     ranges.check(hparams)
+    table = jnp.asarray(table, jnp.float32)
     largest = jnp.max(jnp.abs(table))
     scaled = hparams.bound * table / jnp.where(largest > 0, largest, 1.0)
     return RewardState(scaled, (), traced(hparams))

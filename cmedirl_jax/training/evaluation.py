@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, modes
 from cmedirl_jax.envs import Env
 
 
@@ -90,9 +90,9 @@ def rollout(
         return states, step.observation, done | step.terminated | step.truncated, result, time + 1
 
     nothing = jnp.zeros(count, bool)
-    result = Rollouts(jnp.zeros(count), jnp.zeros(count, jnp.int32), nothing)
+    result = Rollouts(jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32), nothing)
     carry = (states, observations, nothing, result, jnp.zeros((), jnp.int32))
-    return jax.lax.while_loop(running, advance, carry)[3]
+    return jax.lax.while_loop(running, advance, modes.settle(advance, carry))[3]
 
 
 def summarise(rollouts: Rollouts) -> Evaluation:

@@ -8,6 +8,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import modes
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.agents.ddpg import DDPGState
 from cmedirl_jax.agents.hot_start import HotStartData
@@ -119,7 +120,8 @@ def _split(key: jax.Array) -> tuple[_Keys, jax.Array]:
 
 
 def _draw_networks(parts: _Parts, key: jax.Array) -> tuple[Params, Params]:
-    state = parts.algorithm.agent.init(_split(key)[0].agent)
+    # A clone: `init` splits the same key.
+    state = parts.algorithm.agent.init(_split(jax.random.clone(key))[0].agent)
     return state.actor, state.critic
 
 
@@ -152,7 +154,7 @@ def _init(
 
     # The first episode.
     env_state, observation = parts.env.reset(keys.env, parts.env_params)
-    return TrainingState(
+    state = TrainingState(
         key=steps_key,
         agent=algorithm.agent.init(keys.agent, networks),
         reward=reward,
@@ -166,6 +168,7 @@ def _init(
         episode_length=jnp.zeros((), jnp.int32),
         subset=subset,
     )
+    return modes.vary(state, key)
 
 
 def _learn_beforehand(

@@ -12,7 +12,7 @@ import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, modes
 
 State = TypeVar("State")
 
@@ -139,6 +139,7 @@ def step_groups(
             return put(states, stepped, index), put(outputs, output, index)
 
         outputs = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes[1])
+        outputs = modes.vary(outputs, states, shared)
         return jax.lax.fori_loop(0, groups, body, (states, outputs))
 
     return mapped

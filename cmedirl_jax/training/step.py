@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import modes
 from cmedirl_jax.agents.ddpg import DDPGState
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.data.replay import ReplayState
@@ -181,8 +182,10 @@ def _learn_reward(
     )
     reward, info = jax.lax.cond(
         plan.learn_reward,
-        lambda reward: updates.update_reward(parts.updates, reward, take, draws.updates),
-        lambda reward: (reward, base.no_info()),
+        lambda reward: modes.vary(
+            updates.update_reward(parts.updates, reward, take, draws.updates), state, pool
+        ),
+        lambda reward: modes.vary((reward, base.no_info()), state, pool),
         state.reward,
     )
     return reward, sampler_state, info
@@ -219,7 +222,7 @@ def _learn_agent(
         )
         return agent, (info.critic_loss, info.q_mean)
 
-    none = jnp.zeros((), jnp.float32)
+    none = modes.vary(jnp.zeros((), jnp.float32), agent, reward, replay_state, pool)
     return jax.lax.cond(plan.learn, update, lambda agent: (agent, (none, none)), agent)
 
 

@@ -1,5 +1,6 @@
 """What training gave, and what is loaded of it: the same numbers."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -178,6 +179,26 @@ def test_a_seed_is_found_in_its_block(run):
     np.testing.assert_array_equal(first, one)
     assert not np.array_equal(one, ten)
     np.testing.assert_array_equal(load_policy(run, "ddpg", 1, study=0)(OBSERVATIONS), first)
+
+
+def test_what_was_trained_is_loaded_with_other_settings_of_jax(run, tmp_path):
+    method, settings = METHODS["me-ddpg"], cells.finished(run)[0].settings()
+    learner = compose.compose(SPEC, method, settings, 100).learner
+    params = jax.tree.map(
+        lambda leaf: np.full((SEEDS, *leaf.shape), 0.5, leaf.dtype),
+        jax.eval_shape(learner.init, jax.random.key(0)).params,
+    )
+    save(tmp_path, method.name, settings, params, params)
+
+    def loaded():
+        act, r_d = load_policy(run, "ddpg", 0), load_reward(tmp_path, method.name, FIRST)
+        return act(OBSERVATIONS), r_d(OBSERVATIONS, ACTIONS)
+
+    expected = loaded()
+    with jax.enable_x64(True), jax.default_prng_impl("rbg"):
+        found = loaded()
+    chex.assert_trees_all_close(found, expected, rtol=1e-5)
+    chex.assert_trees_all_equal_dtypes(found, expected)
 
 
 THERE = (

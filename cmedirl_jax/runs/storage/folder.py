@@ -12,6 +12,7 @@ from typing import Any
 import filelock
 
 from cmedirl_jax.io import atomic
+from cmedirl_jax.runs import numerics
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import cells, checkpoints, sealing
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
@@ -39,7 +40,8 @@ def check(folder: Path, config: dict[str, Any]) -> None:
         config: its configuration as JSON values.
 
     Raises:
-        UserError: if it cannot be written, or holds another configuration's run or other files.
+        UserError: if it cannot be written, holds another configuration's run, one that was begun
+            with other `numerics`, or other files.
     """
     path = folder / "config.json"
     if not str(folder).isprintable():
@@ -95,7 +97,8 @@ def opened(folder: Path, config: dict[str, Any]) -> Iterator[list[cells.SavedCel
             _remove_unfinished(folder)
             if not ((folder / "config.json").exists() and _begun(folder)):
                 _remove([folder / stored_demonstrations.FOLDER])
-                _write(folder, {"schema": sealing.SCHEMA, "config": config, "versions": versions()})
+                began = {"versions": versions(), "numerics": numerics.current()}
+                _write(folder, {"schema": sealing.SCHEMA, "config": config, **began})
             yield finished
         except UserError:
             if not cells.any_begun(folder):
@@ -184,7 +187,7 @@ def _write(folder: Path, content: dict[str, Any]) -> None:
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """The content of a run's config.json: `config` and `versions`.
+    """The content of a run's config.json: `config`, `versions` and `numerics`.
 
     Raises:
         UserError: if there is none, or it is damaged or of another version.
@@ -193,8 +196,10 @@ def read(folder: Path) -> dict[str, Any]:
     try:
         written = json.loads(path.read_text())
         schema = written["schema"]
-        if not isinstance(written["config"], dict) or not isinstance(written["versions"], dict):
-            raise TypeError("config or versions is no object")
+        # A run of before they were noted has no numerics.
+        parts = (written["config"], written["versions"], written.setdefault("numerics", {}))
+        if not all(isinstance(part, dict) for part in parts):
+            raise TypeError("config, versions or numerics is no object")
     except FileNotFoundError as error:
         raise UserError(f"{folder}: holds no run (there is no config.json)") from error
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
@@ -223,14 +228,22 @@ def identity(config: dict[str, Any]) -> dict[str, Any]:
     """JSON values that a checkpoint shares with a run that continues it."""
     compared = {name: value for name, value in _flat(config).items() if name not in _NOT_COMPARED}
     digest = hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()
-    return {"config": digest, **versions()}
+    return {"config": digest, **versions(), **numerics.current()}
 
 
 def _compare(folder: Path, config: dict[str, Any]) -> None:
     with naming_the_option():
-        before, now = _flat(read(folder)["config"]), _flat(config)
+        written = read(folder)
     if not _begun(folder):
         return
+    began = written["numerics"]
+    for name, value in numerics.current().items():
+        if began.get(name, value) != value:
+            raise UserError(
+                f"--out: {folder} holds a run begun with {name}={began[name]!r}, this is "
+                f"{value!r}; choose another folder or the same setting"
+            )
+    before, now = _flat(written["config"]), _flat(config)
     for name in sorted(before.keys() | now.keys()):
         if name not in _NOT_COMPARED and before.get(name) != now.get(name):
             raise UserError(

@@ -105,6 +105,52 @@ def test_another_configuration_is_refused_naming_the_option_and_both_values(conf
     assert contents(folder) == before
 
 
+@pytest.mark.parametrize(
+    ("mode", "named"),
+    [
+        (jax.default_prng_impl("rbg"), "jax_default_prng_impl='threefry2x32', this is 'rbg';"),
+        (jax.threefry_partitionable(False), "jax_threefry_partitionable=True, this is False;"),
+        (jax.enable_x64(True), "jax_enable_x64=False, this is True;"),
+        (
+            jax.default_matmul_precision("bfloat16"),
+            "jax_default_matmul_precision=None, this is 'bfloat16';",
+        ),
+    ],
+)
+def test_a_run_that_was_begun_with_other_settings_of_jax_is_refused(config, mode, named):
+    folder = begun(config)
+    before = contents(folder)
+    described = validation.describe(config)
+    identity = run_folder.identity(described)
+    with mode:
+        with pytest.raises(UserError) as error:
+            opened(config)
+        assert run_folder.identity(described) != identity
+    assert str(error.value).startswith(f"--out: {folder} holds a run begun with {named}")
+    assert "\n" not in str(error.value)
+    assert contents(folder) == before
+
+
+def test_a_run_that_was_begun_elsewhere_is_refused(config, monkeypatch):
+    begun(config)
+    monkeypatch.setenv("NVIDIA_TF32_OVERRIDE", "1")
+    with pytest.raises(UserError, match="NVIDIA_TF32_OVERRIDE=None, this is '1'"):
+        opened(config)
+    monkeypatch.undo()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with pytest.raises(UserError, match="platform='cpu', this is 'gpu'"):
+        opened(config)
+
+
+def test_a_run_of_before_these_settings_were_noted_goes_on(config):
+    path = begun(config) / "config.json"
+    written = json.loads(path.read_text())
+    del written["numerics"]
+    path.write_text(json.dumps(written))
+    with jax.enable_x64(True):
+        assert opened(config) == config.folder
+
+
 def test_what_is_asked_of_the_demonstrations_may_differ(config):
     folder = begun(config)
     assert opened(dataclasses.replace(config, check_demos="spec")) == folder
@@ -192,6 +238,7 @@ def test_the_folders_spelling_and_the_devices_are_not_compared(config, monkeypat
         b'{"schema": 3, "config": {}}',
         b'{"schema": 4, "config": {}, "versions": {}}',
         b'{"schema": 3, "config": {}, "versions": []}',
+        b'{"schema": 3, "config": {}, "versions": {}, "numerics": []}',
     ],
 )
 def test_a_damaged_or_newer_configuration_is_refused_and_kept(config, damaged):
