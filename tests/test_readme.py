@@ -12,6 +12,7 @@ README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 OTHER_PAGES = [ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "docs/results/README.md"]
 LINK = re.compile(r"\]\(([^)#\s]+\.\w+)[)#]")
+TEST = re.compile(r"(?<=[`/ ])(?:test_|\.\.\._)[a-z][\w.]*(?=`|: )")
 PATH = re.compile(r"`((?:cmedirl_jax|experiments|benchmarks|tests|docs)/[\w./-]*)`")
 
 
@@ -76,3 +77,18 @@ def test_links_and_paths_lead_somewhere(page):
     linked = [page.parent / link for link in LINK.findall(text) if "://" not in link]
     named = [ROOT / path for path in PATH.findall(text)]
     assert [path for path in linked + named if not path.exists()] == []
+
+
+def test_tests_that_are_named_exist():
+    """By a file's or a function's name, of which three points leave out the middle or an end."""
+    files = list((ROOT / "tests").rglob("test_*.py"))
+    there = {path.stem for path in files} | {path.name for path in files}
+    for path in files:
+        there.update(re.findall(r"def (test_\w+)", path.read_text()))
+    named = {name for page in PAGES for name in TEST.findall(page.read_text())}
+    patterns = {name: re.escape(name).replace(r"\.\.\.", r"\w*") for name in named}
+    assert len(named) > 40
+    missing = {
+        name for name, what in patterns.items() if not any(map(re.compile(what).fullmatch, there))
+    }
+    assert missing == set()
