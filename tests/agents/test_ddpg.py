@@ -195,13 +195,11 @@ def test_default_optimiser_is_adam_at_the_states_rate():
     theirs = ddpg.make(
         SPEC, networks=SMALL, actor_optimizer=optax.adam(1e-4), critic_optimizer=optax.adam(1e-3)
     )
+    updates = [jax.jit(agent.update) for agent in (ours, theirs)]
     states = [agent.init(jax.random.key(0)) for agent in (ours, theirs)]
     for step in range(3):
         batch = random_batch(jax.random.key(step), 8)
-        states = [
-            agent.update(state, batch)[0]
-            for agent, state in zip((ours, theirs), states, strict=True)
-        ]
+        states = [update(state, batch)[0] for update, state in zip(updates, states, strict=True)]
     for name in ("actor", "critic"):
         first, second = (getattr(state, name) for state in states)
         chex.assert_trees_all_close(first, second, rtol=1e-5, atol=1e-7)

@@ -76,7 +76,7 @@ def test_critic_loss_and_gradient_equal_a_float64_reference(kind, dims):
             small, critic, hparams, batch.observation, batch.action, jnp.asarray(returns)
         )[0]
 
-    value, gradient = jax.value_and_grad(loss)(critic)
+    value, gradient = jax.jit(jax.value_and_grad(loss))(critic)
 
     def expected(critic):
         return reference_critic_loss(kind, critic, batch, returns)

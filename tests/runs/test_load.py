@@ -54,7 +54,8 @@ def drawn(method, settings):
     """The actors and the reward states of seeds before their first step."""
     parts = trainers.compiled(method, settings)[0].algorithm
     keys = [jax.random.key(seed) for seed in range(SEEDS)]
-    return [parts.agent.init(key).actor for key in keys], [parts.learner.init(key) for key in keys]
+    agent, learner = jax.jit(parts.agent.init), jax.jit(parts.learner.init)
+    return [agent(key).actor for key in keys], [learner(key) for key in keys]
 
 
 TRAINED = ("another bound", "a gauge", "an absorbing state", "a table")
@@ -125,17 +126,9 @@ def test_tables_of_methods_with_a_model_are_functions_too(tmp_path, method):
     settings = Settings(tabular=tabular)
     mdp = imitation.discretised(pools.ENV, tabular)
     data = hot_start.data(pools.scripted(3))
-    fitted = [
-        imitation.fit(
-            jax.random.key(seed),
-            mdp,
-            SPEC,
-            data,
-            kind=METHODS[method].tabular,
-            settings=tabular,
-        )
-        for seed in range(SEEDS)
-    ]
+    kind = METHODS[method].tabular
+    fit = jax.jit(lambda key: imitation.fit(key, mdp, SPEC, data, kind=kind, settings=tabular))
+    fitted = [fit(jax.random.key(seed)) for seed in range(SEEDS)]
     tables = np.stack([result.policy.log_probabilities for result in fitted])
     save(tmp_path, method, settings, tables, np.stack([result.reward for result in fitted]))
     act = load_policy(tmp_path, method, FIRST + 1)
