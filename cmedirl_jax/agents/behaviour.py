@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, modes
 from cmedirl_jax.types import EnvSpec, Numeric
 
 
@@ -122,13 +122,17 @@ def assemble(
     shapes = jax.tree.map(jnp.shape, jax.eval_shape(lambda: draw(jax.random.key(0))))
     checked_perturb = functools.partial(_perturb, spec, shapes, perturb)
     return Exploration(
-        init=init,
+        init=functools.partial(_init, init),
         reset=reset,
         sample=functools.partial(_sample, draw, checked_perturb),
         draw=draw,
         perturb=checked_perturb,
         log_density=functools.partial(_log_density, spec, log_density),
     )
+
+
+def _init(init: Callable[[jax.Array], Any], key: jax.Array) -> Any:
+    return modes.vary(init(key), key)
 
 
 def _sample(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cmedirl_jax import checks, optimizers, ranges
+from cmedirl_jax import checks, modes, optimizers, ranges
 from cmedirl_jax.irl import base, objectives, regularisers, rewards
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.irl.objectives import OBJECTIVES, Likelihood, ObjectiveName
@@ -160,7 +160,8 @@ class _Evaluation(NamedTuple):
 def _init(parts: _Parts, hparams: IRLHParams, key: jax.Array) -> RewardState:
     absorbing = jnp.zeros((), jnp.float32) if hparams.absorbing else None
     params = RewardParams(parts.network.init(key), jnp.zeros((), jnp.float32), absorbing)
-    return RewardState(params, parts.optimizer.init(_learned(params)), traced(hparams))
+    state = RewardState(params, parts.optimizer.init(_learned(params)), traced(hparams))
+    return modes.vary(state, key)
 
 
 def _reward(

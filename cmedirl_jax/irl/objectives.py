@@ -204,7 +204,7 @@ def weighed(
     """
     samples = _samples(demonstrations, background, append)
     counts = _counts(samples)
-    centre = masked_mean(jnp.where(counts, exponent * samples.log_weight, 0.0), counts)
+    centre = masked_mean(exponent * jnp.where(counts, samples.log_weight, 0.0), counts)
 
     weigh = functools.partial(_weigh, centre, exponent, limit)
     return weigh(demonstrations), weigh(background)
@@ -265,7 +265,9 @@ def _mean(scored: Scored) -> jax.Array:
 
 def _normalised(log_weight: jax.Array, counts: jax.Array) -> jax.Array:
     """Weights with sum one; all zero if no entry counts."""
-    largest = jax.lax.stop_gradient(jnp.max(log_weight, initial=-jnp.inf, where=counts))
+    # Finite where nothing counts: inf - inf is NaN, though it is not taken.
+    lowest = jnp.finfo(log_weight.dtype).min
+    largest = jax.lax.stop_gradient(jnp.max(log_weight, initial=lowest, where=counts))
     weight = jnp.where(counts, jnp.exp(jnp.where(counts, log_weight - largest, 0.0)), 0.0)
     return weight / jnp.maximum(jnp.sum(weight), 1.0)
 

@@ -16,11 +16,15 @@ ENVIRONMENT = ("NVIDIA_TF32_OVERRIDE",)
 def current() -> dict[str, bool | int | str | None]:
     """The options and variables by name, and the platform, as JSON values.
 
-    Left out is what only rounds otherwise: XLA's flags, the number of devices, the group of seeds.
+    Left out is what only rounds otherwise: XLA's flags, and the number of devices under the usual
+    generator. Under others a seed draws what depends on the seeds that are stepped together.
     """
+    options = {name: getattr(jax.config, name) for name in OPTIONS}
+    usual = options["jax_default_prng_impl"] == "threefry2x32"
     return {
-        **{name: getattr(jax.config, name) for name in OPTIONS},
+        **options,
         **{name: os.environ.get(name) for name in ENVIRONMENT},
         # Matrix products of GPUs have fewer bits by default, and "rbg" draws other numbers there.
         "platform": jax.default_backend(),
+        "devices": None if usual else jax.device_count(),
     }

@@ -289,7 +289,8 @@ def _log_likelihood(problem: _Problem, reward: jax.Array, policy: SoftPolicy) ->
     if steps is None:
         return _objective(problem, reward, policy)
     time = jnp.arange(steps.mask.shape[1])
-    taken = problem.control["discount"] ** time * log_pi[time, steps.state, steps.action]
+    discounts = jnp.asarray(problem.control["discount"], log_pi.dtype) ** time
+    taken = discounts[None] * log_pi[time[None], steps.state, steps.action]
     return jnp.sum(jnp.where(steps.mask, taken, 0.0)) / steps.mask.shape[0]
 
 

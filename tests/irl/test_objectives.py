@@ -91,6 +91,14 @@ def test_without_samples_the_likelihood_and_its_gradient_are_zero(objective):
         assert (likelihood.value, likelihood.effective_sample_size) == (0.0, 0.0)
 
 
+def test_without_samples_no_nan_arises_where_it_would_not_be_taken():
+    nothing = Scored(jnp.ones(3), jnp.full(3, -jnp.inf), jnp.zeros(3, bool))
+    with jax.disable_jit(), jax.debug_nans(True):
+        weighed = objectives.weighed(nothing, nothing, append=True, exponent=0.0)
+        assert objectives.visitation(*weighed, append=True) == (0.0, 0.0)
+        assert objectives.transition(*weighed, append=True) == (0.0, 0.0)
+
+
 def test_infinite_densities_of_either_sign_have_weight_zero_and_nan_is_kept():
     log_weight = objectives.log_weight(jnp.array([jnp.inf, -jnp.inf, 2.0, -300.0, jnp.nan]))
     np.testing.assert_array_equal(log_weight, [-np.inf, -np.inf, -2.0, 300.0, np.nan])

@@ -142,6 +142,15 @@ def test_a_run_that_was_begun_elsewhere_is_refused(config, monkeypatch):
         opened(config)
 
 
+def test_the_number_of_devices_is_part_of_a_run_where_seeds_draw_together(config, monkeypatch):
+    monkeypatch.setattr(jax, "device_count", lambda: 2)
+    with jax.default_prng_impl("rbg"):
+        begun(config)
+        monkeypatch.setattr(jax, "device_count", lambda: 1)
+        with pytest.raises(UserError, match="begun with devices=2, this is 1"):
+            opened(config)
+
+
 def test_a_run_of_before_these_settings_were_noted_goes_on(config):
     path = begun(config) / "config.json"
     written = json.loads(path.read_text())
