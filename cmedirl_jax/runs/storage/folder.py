@@ -14,7 +14,7 @@ import filelock
 from cmedirl_jax.io import atomic
 from cmedirl_jax.runs import numerics
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.storage import cells, checkpoints, sealing
+from cmedirl_jax.runs.storage import cells, checkpoints, outputs, sealing
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 
 PACKAGES = (
@@ -180,10 +180,7 @@ def _begun(folder: Path) -> bool:
 
 
 def _write(folder: Path, content: dict[str, Any]) -> None:
-    if (folder / "config.json").exists() and read(folder) == content:
-        return
-    with atomic.replacing(folder / "config.json") as partial:
-        partial.write_text(json.dumps(content, indent=2) + "\n")
+    outputs.write(folder / "config.json", (json.dumps(content, indent=2) + "\n").encode())
 
 
 def read(folder: Path) -> dict[str, Any]:
