@@ -25,7 +25,7 @@ def control(dynamics, horizon, key, batch):
 
 
 def counted():
-    state, action = np.int32([[0, 1], [1, 2]]), np.int32([[1, 0], [0, 0]])
+    state, action = np.int32([[0, 1], [1, 0]]), np.int32([[1, 0], [0, 0]])
     discount = np.float32(0.5)
     return cm.tabular.empirical_visitation(
         state, action, np.ones((2, 2), bool), (3, 2), discount=discount
