@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, modes
 from cmedirl_jax.envs.base import Env, Step
 from cmedirl_jax.types import EnvSpec
 
@@ -112,7 +112,8 @@ def _play(env: Env, params: Any, steps: int) -> _Played:
     first = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(reset_key, EPISODES), params)
     shape = (steps, EPISODES, spec.action_dim)
     share = jax.random.uniform(action_key, shape, jnp.float32).at[:, 0].set(0.0).at[:, 1].set(1.0)
-    actions = spec.action_low + share * (spec.action_high - spec.action_low)
+    share, low, high = modes.align(share, spec.action_low, spec.action_high)
+    actions = low + share * (high - low)
     step_all = jax.vmap(env.step, in_axes=(0, 0, 0, None))
 
     def advance(carry: Any, draws: Any) -> Any:

@@ -227,3 +227,8 @@ def test_what_a_task_answers_after_an_episodes_end_is_not_asked(short):
         )
 
     envs.check(short._replace(step=step))
+
+
+def test_a_program_that_asks_for_equal_ranks_can_check_its_task(short):
+    with jax.numpy_rank_promotion("raise"):
+        envs.check(short)
