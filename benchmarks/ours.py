@@ -16,10 +16,8 @@ from cmedirl_jax.irl.reward_batches import RewardBatchSettings
 from cmedirl_jax.irl.rewards import RewardNetworkSettings
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells import compiled as compiled_lib
-from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.slots import Slots
-from cmedirl_jax.training import seeds
 from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.schedules import RewardSchedule, Schedule
 from cmedirl_jax.training.settings import Settings
@@ -91,17 +89,11 @@ def compile_programs(
         group: seeds that a device steps together; None: the library's choice.
         subset_size: demonstrations of each seed; None without any.
     """
-    env, architecture = envs.make("MountainCarContinuous-v0"), settings.architecture
-    group = group or seeds.group_size(seeds_count, len(devices), architecture.hidden)
-    return compiled_lib.compile_method(
-        env,
-        METHODS[method],
-        settings,
-        evaluator_lib.of_networks(env, architecture, group, devices),
-        compiled_lib.compile_networks(env, architecture, group, devices),
-        group=group,
-        seeds_count=seeds_count,
-        devices=devices,
+    programs = compiled_lib.compiler(
+        envs.make("MountainCarContinuous-v0"),
+        devices,
         capacity=CAPACITY,
         subset_size=subset_size,
+        group=group,
     )
+    return programs(METHODS[method], settings, seeds_count)

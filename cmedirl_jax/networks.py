@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks, modes, ranges
+from cmedirl_jax import checks, modes, products, ranges
 from cmedirl_jax.ranges import Count, NotNegative, Size
 from cmedirl_jax.types import EnvSpec, Network, Params
 
@@ -269,7 +269,12 @@ def _dense(units: int, bound: float) -> nn.Dense:
     """A dense layer whose kernel and bias are drawn from U(-bound, bound)."""
 
     initialise = functools.partial(jax.random.uniform, minval=-bound, maxval=bound)
-    return nn.Dense(units, kernel_init=initialise, bias_init=initialise)
+    return nn.Dense(
+        units,
+        kernel_init=initialise,
+        bias_init=initialise,
+        dot_general=products.dot_general,
+    )
 
 
 def _identity(observation: jax.Array) -> jax.Array:

@@ -65,13 +65,18 @@ class Initialisation(NamedTuple):
     Attributes:
         draw_networks: `key -> (actor, critic)`, the parameters that `init` starts from. They are
             the same for every method, so that one compiled program may draw them for all.
-        init: `(key, data, n_demonstrations, networks=None) -> TrainingState`, the hot start and the
-            fit of a tabular reward included.
+        hot_start: `(key, data, n_demonstrations, networks) -> networks`, the networks drawn after
+            their hot start; as they are for a method without. Methods that share its settings share
+            the result.
+        init: `(key, data, n_demonstrations, networks=None) -> TrainingState`, the fit of a tabular
+            reward included.
             `data` is what `hot_start.data` made of the pool, or None for methods without
-            demonstrations; `networks` is what `draw_networks` gave, where that was called apart.
+            demonstrations; `networks` is what the two functions above gave, where they were called
+            apart.
     """
 
     draw_networks: Callable[[jax.Array], tuple[Params, Params]]
+    hot_start: Callable[..., tuple[Params, Params]]
     init: Callable[..., TrainingState]
 
 
@@ -86,7 +91,11 @@ def make(
 ) -> Initialisation:
     """Make the initialisation of a method's seeds; see `trainer.make`."""
     parts = _Parts(env, env_params, method, settings, algorithm, subset_size)
-    return Initialisation(functools.partial(_draw_networks, parts), functools.partial(_init, parts))
+    return Initialisation(
+        functools.partial(_draw_networks, parts),
+        functools.partial(_hot_start, parts),
+        functools.partial(_init, parts),
+    )
 
 
 class _Parts(NamedTuple):
@@ -125,6 +134,42 @@ def _draw_networks(parts: _Parts, key: jax.Array) -> tuple[Params, Params]:
     return state.actor, state.critic
 
 
+def _hot_start(
+    parts: _Parts,
+    key: jax.Array,
+    data: HotStartData | None,
+    n_demonstrations: Numeric,
+    networks: tuple[Params, Params],
+) -> tuple[Params, Params]:
+    if not parts.method.hot_start:
+        return networks
+    keys, _ = _split(jax.random.clone(key))
+    data, subset = _demonstrations(parts, keys, data, n_demonstrations)
+    return hot_start.fit(
+        keys.hot_start,
+        parts.algorithm.agent.networks,
+        networks,
+        data,
+        parts.settings.hot_start,
+        subset=subset,
+    )
+
+
+def _demonstrations(
+    parts: _Parts, keys: _Keys, data: HotStartData | None, n_demonstrations: Numeric
+) -> tuple[HotStartData, DemonstrationSubset]:
+    """The pool, and the seed's own demonstrations of it.
+
+    Raises:
+        ValueError: without a pool.
+    """
+    if data is None:
+        raise ValueError(f"{parts.method.name} needs demonstrations")
+    return data, demonstrations_lib.subset(
+        keys.subset, data.episodes, n_demonstrations, parts.subset_size
+    )
+
+
 def _init(
     parts: _Parts,
     key: jax.Array,
@@ -135,18 +180,16 @@ def _init(
     algorithm = parts.algorithm
     keys, steps_key = _split(key)
     if networks is None:
-        networks = _draw_networks(parts, key)
+        drawn = _draw_networks(parts, key)
+        networks = _hot_start(parts, key, data, n_demonstrations, drawn)
     reward = algorithm.learner.init(keys.reward) if algorithm.learner else None
     subset, sampler_state = None, None
 
-    # What the demonstrations give: the hot start, a tabular reward, the sampler's fitted Gaussian.
+    # What the demonstrations give: a tabular reward, the sampler's fitted Gaussian.
     if parts.method.uses_demonstrations:
-        if data is None:
-            raise ValueError(f"{parts.method.name} needs demonstrations")
-        subset = demonstrations_lib.subset(
-            keys.subset, data.episodes, n_demonstrations, parts.subset_size
-        )
-        networks, reward = _learn_beforehand(parts, keys, data, subset, networks, reward)
+        data, subset = _demonstrations(parts, keys, data, n_demonstrations)
+        if parts.method.tabular is not None:
+            reward = _fit_table(parts, keys, data, subset)
         if algorithm.sampler is not None:
             sampler_state = algorithm.sampler.init(
                 keys.sampler, networks[0], data.transition, subset
@@ -171,35 +214,20 @@ def _init(
     return modes.vary(state, key)
 
 
-def _learn_beforehand(
-    parts: _Parts,
-    keys: _Keys,
-    data: HotStartData,
-    subset: DemonstrationSubset,
-    networks: tuple[Params, Params],
-    reward: RewardState | None,
-) -> tuple[tuple[Params, Params], RewardState | None]:
-    """Hot-start the networks, and fit a tabular reward, where the method does so."""
-    method, settings = parts.method, parts.settings
-    if method.hot_start:
-        networks = hot_start.fit(
-            keys.hot_start,
-            parts.algorithm.agent.networks,
-            networks,
-            data,
-            settings.hot_start,
-            subset=subset,
-        )
-    if method.tabular is not None:
-        mdp = imitation.discretised(parts.env, settings.tabular, params=parts.env_params)
-        fitted = imitation.fit(
-            keys.reward,
-            mdp,
-            parts.env.spec,
-            data,
-            subset,
-            kind=method.tabular,
-            settings=settings.tabular,
-        )
-        reward = table_reward.state(fitted.reward[:-1], settings.reward)
-    return networks, reward
+def _fit_table(
+    parts: _Parts, keys: _Keys, data: HotStartData, subset: DemonstrationSubset
+) -> RewardState:
+    """The reward that dynamic programming learns from the demonstrations."""
+    assert parts.method.tabular is not None
+    settings = parts.settings
+    mdp = imitation.discretised(parts.env, settings.tabular, params=parts.env_params)
+    fitted = imitation.fit(
+        keys.reward,
+        mdp,
+        parts.env.spec,
+        data,
+        subset,
+        kind=parts.method.tabular,
+        settings=settings.tabular,
+    )
+    return table_reward.state(fitted.reward[:-1], settings.reward)

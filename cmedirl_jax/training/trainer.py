@@ -43,6 +43,7 @@ class Trainer(NamedTuple):
     Attributes:
         algorithm: the method's parts.
         draw_networks: see `initialise.Initialisation`.
+        hot_start: likewise.
         init: likewise.
         draw: `(key, subset, step) -> StepDraws`, of environment step number `step` `[]` int32 of
             the seed whose state has this `key` and this `subset`.
@@ -61,6 +62,7 @@ class Trainer(NamedTuple):
 
     algorithm: Algorithm
     draw_networks: Callable[[jax.Array], tuple[Params, Params]]
+    hot_start: Callable[..., tuple[Params, Params]]
     init: Callable[..., TrainingState]
     draw: Callable[[jax.Array, DemonstrationSubset | None, jax.Array], StepDraws]
     plan: Callable[[jax.Array], Plan]
@@ -116,6 +118,7 @@ def make(
     return Trainer(
         algorithm=algorithm,
         draw_networks=beginning.draw_networks,
+        hot_start=beginning.hot_start,
         init=beginning.init,
         draw=functools.partial(step_lib.draw, parts),
         plan=plan,

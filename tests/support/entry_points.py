@@ -184,7 +184,8 @@ def train(method, key, batch):
     del batch
     made = cm.training.make(ENV, cm.METHODS[method], SETTINGS, capacity=8)
     pool = DATA if cm.METHODS[method].uses_demonstrations else None
-    state = made.init(key, pool, 2, made.draw_networks(key))
+    networks = made.hot_start(key, pool, 2, made.draw_networks(key))
+    state = made.init(key, pool, 2, networks)
     if not cm.METHODS[method].interacts:
         return state
     return made.run(state, pool, jnp.arange(4, dtype=jnp.int32), 2)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax.agents.hot_start import HotStartData
-from cmedirl_jax.runs.cells.compiled import CompiledMethod, begin, pack
+from cmedirl_jax.runs.cells.compiled import CompiledMethod, abstract, begin, pack
 from cmedirl_jax.runs.cells.record import Budget, EpisodeRows, EvaluationRows, Record
 from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer, Snapshot
@@ -83,20 +83,18 @@ def train(
     """
     slots = Slots(programs.slots, seeds_count, programs.group, programs.devices)
 
-    def init() -> TrainingState:
-        return begin(programs, slots, key, data, n_demos, first_seed)
-
     # Begin, or continue from a checkpoint.
-    abstract = functools.cache(lambda: jax.eval_shape(init))
+    shapes = functools.cache(lambda: abstract(programs, data, n_demos))
     saved = None
     if checkpointer is not None:
         saved = checkpointer.load(
-            lambda arrays: _saved_like(abstract(), seeds_count, n_demos, arrays)
+            lambda arrays: _saved_like(shapes(), seeds_count, n_demos, arrays)
         )
     if saved is None:
-        training = _Training.begin(programs, data, n_demos, budget, slots, init())
+        state = begin(programs, slots, key, data, n_demos, first_seed)
+        training = _Training.begin(programs, data, n_demos, budget, slots, state)
     else:
-        training = _Training.resume(programs, data, n_demos, budget, slots, abstract(), saved)
+        training = _Training.resume(programs, data, n_demos, budget, slots, shapes(), saved)
 
     # Train, chunk after chunk.
     report(Progress(training.step, training.record.solved_fraction(threshold)))

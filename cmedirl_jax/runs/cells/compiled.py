@@ -24,7 +24,10 @@ class CompiledMethod(NamedTuple):
     """The compiled functions of a method. Every cell of the method uses the same ones.
 
     Attributes:
-        init: `(keys [slots], groups, data, n_demonstrations) -> TrainingState` `[slots, ...]`.
+        draw_networks: `(keys [slots], groups) -> networks` `[slots, ...]`.
+        hot_start: `(keys, networks, groups, data, n_demonstrations) -> networks`; None for a method
+            without. It keeps its latest answer, which the next method asks for again.
+        init: `(keys, networks, groups, data, n_demonstrations) -> TrainingState` `[slots, ...]`.
         run: `(state, groups, data, steps, max_episodes) -> (TrainingState, Log)`; the state is
             donated. Only the first `groups` groups of slots on each device are stepped.
         permute: `(state, move [slots]) -> TrainingState`: slot i takes the seed of slot move[i].
@@ -36,6 +39,8 @@ class CompiledMethod(NamedTuple):
         sharding: how the slots lie on them.
     """
 
+    draw_networks: Callable[[jax.Array, int], Any]
+    hot_start: Callable[..., Any] | None
     init: Callable[..., TrainingState]
     run: Callable[..., tuple[TrainingState, Log]]
     permute: Callable[[TrainingState, np.ndarray], TrainingState]
@@ -62,12 +67,50 @@ def compile_networks(
     return jax.jit(draw, out_shardings=seeds.sharding(devices))
 
 
+def compile_hot_start(
+    env: Env, settings: Settings, subset_size: int | None, group: int, devices: Sequence[Any]
+) -> Callable[..., Any]:
+    """Jit the hot start, which all methods that have one share; see `CompiledMethod.hot_start`."""
+    trainer = training.make(env, METHODS["bc"], settings, capacity=1, subset_size=subset_size)
+
+    def of_seed(drawn: tuple[jax.Array, Any], data: HotStartData, n_demos: int):
+        key, networks = drawn
+        return drawn, trainer.hot_start(key, data, n_demos, networks)
+
+    def fit(keys: jax.Array, networks: Any, groups: int, data: HotStartData, n_demos: int) -> Any:
+        spread = seeds.map_devices(seeds.step_groups(of_seed, group), devices)
+        return spread((keys, networks), groups, data, n_demos)[1]
+
+    return _Latest(jax.jit(fit, out_shardings=seeds.sharding(devices)))
+
+
+class _Latest:
+    """A compiled hot start that gives its latest answer again to an equal question."""
+
+    def __init__(self, fit: Callable[..., Any]):
+        self._fit = fit
+        self._question: Any = None
+        self._data: HotStartData | None = None
+        self._answer: Any = None
+
+    def __call__(
+        self, keys: jax.Array, networks: Any, groups: int, data: HotStartData, n_demos: int
+    ) -> Any:
+        # The keys decide the networks too.
+        question = (np.asarray(jax.random.key_data(keys)).tobytes(), groups, n_demos)
+        if question != self._question or data is not self._data:
+            self._answer = self._fit(keys, networks, groups, data, n_demos)
+            self._question, self._data = question, data
+        return self._answer
+
+
 def compile_method(
     env: Env,
     method: Method,
     settings: Settings,
     evaluator: Evaluator,
     draw_networks: Callable[[jax.Array, int], Any],
+    hot_start: Callable[..., Any] | None,
     *,
     group: int,
     seeds_count: int,
@@ -95,15 +138,10 @@ def compile_method(
 
     # The same sharding everywhere: JAX compiles again for another one, even if it is equivalent.
     split = seeds.sharding(devices)
-    start = jax.jit(start, out_shardings=split)
-
-    def init(
-        keys: jax.Array, groups: int, data: HotStartData | None, n_demonstrations: int
-    ) -> TrainingState:
-        return start(keys, draw_networks(keys, groups), groups, data, n_demonstrations)
-
     return CompiledMethod(
-        init=init,
+        draw_networks=draw_networks,
+        hot_start=hot_start,
+        init=jax.jit(start, out_shardings=split),
         run=jax.jit(spread(trainer.run), donate_argnums=0, out_shardings=split),
         permute=jax.jit(permute, donate_argnums=0, out_shardings=split),
         evaluator=evaluator,
@@ -128,7 +166,19 @@ def begin(
     """
     groups = slots.groups(np.ones(slots.seeds, bool))
     keys = seeds.keys(key, first_seed + programs.slots)[first_seed:][slots.seed]
-    return programs.init(keys, groups, data, n_demos)
+    networks = programs.draw_networks(keys, groups)
+    if programs.hot_start is not None:
+        networks = programs.hot_start(keys, networks, groups, data, n_demos)
+    return programs.init(keys, networks, groups, data, n_demos)
+
+
+def abstract(programs: CompiledMethod, data: HotStartData | None, n_demos: int) -> TrainingState:
+    """The shapes and dtypes of what `begin` makes."""
+
+    def of_keys(keys: jax.Array) -> TrainingState:
+        return programs.init(keys, programs.draw_networks(keys, 1), 1, data, n_demos)
+
+    return jax.eval_shape(of_keys, seeds.keys(jax.random.key(0), programs.slots))
 
 
 def pack(
@@ -146,7 +196,7 @@ def compiler(
     devices: Sequence[Any],
     *,
     capacity: int,
-    subset_size: int,
+    subset_size: int | None,
     least_slots: int = 0,
     group: int | None = None,
     gather: Callable[[Any], Any] = ALONE.gather,
@@ -157,7 +207,7 @@ def compiler(
         env: the task.
         devices: that share the seeds.
         capacity: transitions in a replay where the settings leave it open.
-        subset_size: the largest number of demonstrations of a seed.
+        subset_size: the largest number of demonstrations of a seed; None without any.
         least_slots: seeds that there is room for at least, so that experts share a program.
         group: seeds that are stepped together on a device; None: what is fastest.
         gather: arrays of all devices as numpy.
@@ -179,6 +229,10 @@ def compiler(
         return compile_networks(env, architecture, group, devices)
 
     @functools.cache
+    def hot_start(settings: Settings, group: int) -> Callable:
+        return compile_hot_start(env, settings, subset_size, group, devices)
+
+    @functools.cache
     def compile_once(method: Method, settings: Settings, count: int) -> CompiledMethod:
         architecture = settings.architecture
         size = group_of(architecture, count)
@@ -188,6 +242,7 @@ def compiler(
             settings,
             evaluator(architecture, size),
             draw_networks(architecture, size),
+            hot_start(settings, size) if method.hot_start else None,
             group=size,
             seeds_count=max(count, least_slots),
             devices=devices,

@@ -16,7 +16,6 @@ from cmedirl_jax.io import checkpoint
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells import compiled as compiled_lib
-from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells.cell import CellResult, Progress
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.console.signals import Interruption
@@ -69,18 +68,10 @@ def compile_linear(env, method="ddpg", subset_size=None):
         hot_start=HotStartHParams(steps=2),
     )
     devices = jax.devices()[:1]
-    return compiled_lib.compile_method(
-        short,
-        METHODS[method],
-        settings,
-        evaluator_lib.of_networks(short, settings.architecture, 2, devices),
-        compiled_lib.compile_networks(short, settings.architecture, 2, devices),
-        group=2,
-        seeds_count=SEEDS,
-        devices=devices,
-        capacity=BY_EPISODES.max_steps,
-        subset_size=subset_size,
+    programs = compiled_lib.compiler(
+        short, devices, capacity=BY_EPISODES.max_steps, subset_size=subset_size, group=2
     )
+    return programs(METHODS[method], settings, SEEDS)
 
 
 @pytest.fixture(scope="module")
