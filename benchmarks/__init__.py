@@ -6,6 +6,7 @@ COMMANDS = (
     "seeds_per_second",
     "peers",
     "profile",
+    "main_job",
     "checkpoint_cost",
     "soak",
     "scaling",

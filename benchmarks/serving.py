@@ -28,8 +28,17 @@ _MARK = "answer: "
 _PIN = """
 import os, sys
 os.sched_setaffinity(0, map(int, sys.argv[1].split(",")))
-os.execv(sys.argv[2], sys.argv[2:])
+os.execvp(sys.argv[2], sys.argv[2:])
 """
+
+
+def pinned(command: Sequence[str], cores: Sequence[int] | None) -> list[str]:
+    """`command` on `cores` alone, if given and if the system can pin processes."""
+    if cores is None or not hasattr(os, "sched_setaffinity"):
+        return list(command)
+    # A small program pins itself and becomes the command: code between fork and exec is unsafe in a
+    # process where JAX has started threads.
+    return [sys.executable, "-c", _PIN, ",".join(map(str, cores)), *command]
 
 
 def serve(advance: Callable[[int], Any], steps: int, facts: Callable[[], dict] = dict) -> None:
@@ -71,15 +80,11 @@ class Worker:
 
     def __init__(self, command: Sequence[str], cores: Sequence[int] | None, **environment: str):
         """Start `command`, on `cores` alone if given and if the system can pin processes."""
-        if cores is not None and hasattr(os, "sched_setaffinity"):
-            # A small program pins itself and becomes the command: code between fork and exec is
-            # unsafe in a process where JAX has started threads.
-            command = [sys.executable, "-c", _PIN, ",".join(map(str, cores)), *command]
         root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
         # A file, since a pipe that nobody reads would block a process with many messages.
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115
         self._process = subprocess.Popen(
-            command,
+            pinned(command, cores),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,

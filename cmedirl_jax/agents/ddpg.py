@@ -279,26 +279,36 @@ def _update_actor(
     clone: Numeric,
 ) -> tuple[DDPGState, jax.Array]:
     """Take a gradient step of the actor; also its loss, before it."""
-    (loss, actor), grads = jax.value_and_grad(actor_loss, argnums=1, has_aux=True)(
-        parts.networks, state.actor, state.critic, state.hparams, batch
-    )
-    if demonstrations is not None:
-        # A gradient of its own, so that the term costs nothing once it has faded out.
-        cloning_loss, cloning_grads = _when(
+    gradient = functools.partial(_actor_gradient, parts.networks, state, batch)
+    if demonstrations is None:
+        (loss, actor), grads = gradient(state.actor, None)
+    else:
+        # A branch of its own, so that the term costs nothing once it has faded out.
+        (loss, actor), grads = _when(
             clone,
-            lambda actor: jax.value_and_grad(behaviour_cloning_loss, argnums=1)(
-                parts.networks, actor, state.critic, state.hparams, demonstrations
-            ),
-            lambda actor: (jnp.zeros_like(loss), jax.tree.map(jnp.zeros_like, actor)),
-            actor,
+            lambda actor: gradient(actor, demonstrations),
+            lambda actor: gradient(actor, None),
+            state.actor,
         )
-        loss, grads = jax.tree.map(jnp.add, (loss, grads), (cloning_loss, cloning_grads))
     updates, optimizer = parts.actor_optimizer.update(
         grads, state.actor_optimizer, actor, learning_rate=state.hparams.actor_learning_rate
     )
     actor = optax.apply_updates(actor, updates)
     # 32 bits under x64 too, as in the branch that leaves the actor alone.
     return state.replace(actor=actor, actor_optimizer=optimizer), loss.astype(jnp.float32)
+
+
+def _actor_gradient(
+    networks: ActorCritic,
+    state: DDPGState,
+    batch: Transition,
+    actor: Params,
+    demonstrations: Transition | None,
+) -> tuple[tuple[jax.Array, Params], Params]:
+    """The actor's loss, its parameters with running statistics moved, and the loss's gradient."""
+    return jax.value_and_grad(actor_loss, argnums=1, has_aux=True)(
+        networks, actor, state.critic, state.hparams, batch, demonstrations
+    )
 
 
 def _move_targets(state: DDPGState) -> DDPGState:
@@ -337,16 +347,25 @@ def critic_loss(
 
 
 def actor_loss(
-    networks: ActorCritic, actor: Params, critic: Params, hparams: DDPGHParams, batch: Transition
+    networks: ActorCritic,
+    actor: Params,
+    critic: Params,
+    hparams: DDPGHParams,
+    batch: Transition,
+    demonstrations: Transition | None = None,
 ) -> tuple[jax.Array, Params]:
     """-1/B sum_i Q(s_i, mu(s_i)), whose gradient is Eq. 3's, plus the pre-activation penalty.
 
-    Also the parameters, with running statistics moved where there are any.
+    With `demonstrations` `[D, ...]` also plus `behaviour_cloning_loss`. Also gives the parameters,
+    with running statistics moved where there are any.
     """
-    pre_activation, actor = networks_lib.train_mode(networks.actor)(actor, batch.observation)
+    pre_activation, moved = networks_lib.train_mode(networks.actor)(actor, batch.observation)
     q = networks.critic.apply(critic, batch.observation, networks.squash(pre_activation))
     penalty = jnp.mean(jnp.square(pre_activation))
-    return -jnp.mean(q) + hparams.pre_activation_penalty * penalty, actor
+    loss = -jnp.mean(q) + hparams.pre_activation_penalty * penalty
+    if demonstrations is not None:
+        loss += behaviour_cloning_loss(networks, actor, critic, hparams, demonstrations)
+    return loss, moved
 
 
 def behaviour_cloning_loss(

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from cmedirl_jax.runs import train
 from cmedirl_jax.runs.cluster.base import ALONE, Cluster
-from cmedirl_jax.runs.console import compile_cache
+from cmedirl_jax.runs.console import compile_cache, phases
 from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import cells, checkpoints
@@ -71,8 +71,14 @@ def run(
             for name, version in entered["began"].items():
                 console.print(f"This run was begun with {name} {version}", highlight=False)
             session = train.session_of(plan, devices, console, interruption, cluster)
-            with compile_cache.counted() as cost, _within_memory(plan.folder):
+            with (
+                compile_cache.counted() as cost,
+                phases.counted() as seconds,
+                _within_memory(plan.folder),
+            ):
                 train.train_cells(session, todo)
+            spent = ", ".join(f"{name} {took:.1f} s" for name, took in seconds.items())
+            console.print(f"Time: {spent}", highlight=False)
             console.print(
                 f"Compilation took {cost.seconds:.1f} s; {cost.hits} programs came from the cache, "
                 f"{cost.misses} did not",

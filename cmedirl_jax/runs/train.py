@@ -21,6 +21,7 @@ from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.evaluator import Evaluator
 from cmedirl_jax.runs.cluster.base import Cluster
 from cmedirl_jax.runs.console import screen
+from cmedirl_jax.runs.console.phases import phase
 from cmedirl_jax.runs.console.progress import Reporter, reporter
 from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.storage import cells, checkpoints, plain, tables
@@ -203,9 +204,11 @@ def _train_cell(
     plan, fresh_starts = session.plan, session.keys.fresh_starts
 
     # Evaluate each seed's best policy, in JAX and in Gymnasium.
-    fresh = evaluator.on_fresh_starts(result.best, fresh_starts, FRESH_STARTS)
-    best_return = evaluator.summarise(fresh).return_mean
-    replay = gymnasium_replay.replay(evaluator, result.best, plan.env)
+    with phase("evaluation"):
+        fresh = evaluator.on_fresh_starts(result.best, fresh_starts, FRESH_STARTS)
+        best_return = evaluator.summarise(fresh).return_mean
+    with phase("Gymnasium"):
+        replay = gymnasium_replay.replay(evaluator, result.best, plan.env)
 
     # Save.
     metadata: dict[str, Any] = pool.metadata if cell.n_demos else {"expert": "none"}
@@ -233,7 +236,8 @@ def _train_cell(
             "numerics": numerics.current(),
         }
         trees = {"policies": result.best, "rewards": result.reward}
-        cells.save(plan.folder, key, description, rows, trees, session.cluster.call)
+        with phase("saving"):
+            cells.save(plan.folder, key, description, rows, trees, session.cluster.call)
         checkpointer.remove()
 
 

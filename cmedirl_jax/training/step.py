@@ -96,13 +96,17 @@ def step_keys(key: jax.Array, step: jax.Array) -> jax.Array:
 
 
 def draw(
-    parts: StepParts, key: jax.Array, subset: DemonstrationSubset | None, step: jax.Array
+    parts: StepParts,
+    key: jax.Array,
+    subset: DemonstrationSubset | None,
+    step: jax.Array,
+    demonstrated: Numeric = True,
 ) -> StepDraws:
     """Draw the randomness of step number `step` `[]`; see `trainer.Trainer`."""
     _, _, noise_key, updates_key = step_keys(key, step)
     return StepDraws(
         noise=parts.algorithm.exploration.draw(noise_key),
-        updates=updates.draw(parts.updates, updates_key, subset),
+        updates=updates.draw(parts.updates, updates_key, subset, demonstrated),
     )
 
 

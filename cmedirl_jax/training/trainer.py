@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from cmedirl_jax import envs
 from cmedirl_jax import networks as networks_lib
@@ -142,9 +143,12 @@ def _run(
     pool = None if data is None else data.transition
     # One vectorised call hashes a chunk's randomness faster than one call per step.
     keys = jax.vmap(step_lib.step_keys, in_axes=(None, 0))(state.key, steps)
-    draws = jax.vmap(lambda step: step_lib.draw(parts, state.key, state.subset, step))(steps)
-    starts = jax.vmap(env.reset, in_axes=(0, None))(keys[:, 1], env_params)
     plans = jax.vmap(plan)(steps)
+    demonstrated = jnp.any(plans.learn_reward | (plans.cloning_weight > 0.0))
+    draws = jax.vmap(
+        lambda step: step_lib.draw(parts, state.key, state.subset, step, demonstrated)
+    )(steps)
+    starts = jax.vmap(env.reset, in_axes=(0, None))(keys[:, 1], env_params)
 
     def advance(state: TrainingState, inputs: Any) -> tuple[TrainingState, Log]:
         env_key, start, draws, now = inputs

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from cmedirl_jax import modes
 from cmedirl_jax.agents.ddpg import DDPGInfo, DDPGState
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
@@ -81,25 +82,43 @@ class UpdateDraws(NamedTuple):
     cloning: jax.Array
 
 
-def draw(parts: UpdateParts, key: jax.Array, subset: DemonstrationSubset | None) -> UpdateDraws:
-    """Draw a step's minibatches from the seed's subset of the demonstrations."""
+def draw(
+    parts: UpdateParts,
+    key: jax.Array,
+    subset: DemonstrationSubset | None,
+    demonstrated: Numeric = True,
+) -> UpdateDraws:
+    """Draw a step's minibatches from the seed's subset of the demonstrations.
+
+    Where `demonstrated` is False nothing is learned from demonstrations: zeros stand for what would
+    be drawn for that.
+    """
     replay, sampler = parts.algorithm.replay, parts.algorithm.sampler
     batch_key, background_key, demonstrations_key = jax.random.split(key, 3)
     # Rows of the pool, shared by behaviour cloning and a reward that learns from pairs.
     cloned = 0 if parts.cloning == "none" else parts.batch_size
     sampled = parts.reward_samples
     shared = sampled if sampler is not None and sampler.shares_pairs else 0
-    rows = jnp.zeros((0,), jnp.int32)
-    if max(cloned, shared) and subset is not None:
-        rows = demonstrations.sample_index(demonstrations_key, subset, max(cloned, shared))
-    chosen = rows[:0]
-    if sampler is not None and subset is not None:
-        chosen = sampler.choose(jax.random.fold_in(key, 4), subset, rows, sampled)
+
+    def draw_demonstrated() -> tuple[SampleDraws, jax.Array]:
+        rows = jnp.zeros((0,), jnp.int32)
+        if max(cloned, shared) and subset is not None:
+            rows = demonstrations.sample_index(demonstrations_key, subset, max(cloned, shared))
+        chosen = rows[:0]
+        if sampler is not None and subset is not None:
+            chosen = sampler.choose(jax.random.fold_in(key, 4), subset, rows, sampled)
+        return SampleDraws(replay.draw(background_key, sampled), chosen), rows[:cloned]
+
+    shapes = jax.eval_shape(draw_demonstrated)
+    zeros = modes.vary(
+        jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes), key, subset
+    )
+    reward, cloning = jax.lax.cond(demonstrated, draw_demonstrated, lambda: zeros)
     return UpdateDraws(
         batch=replay.draw(batch_key, parts.batch_size),
-        reward=SampleDraws(replay.draw(background_key, sampled), chosen),
+        reward=reward,
         penalty=jax.random.fold_in(key, 3) if parts.algorithm.reward_draws else None,
-        cloning=rows[:cloned],
+        cloning=cloning,
     )
 
 

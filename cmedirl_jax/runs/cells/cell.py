@@ -12,6 +12,7 @@ from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.runs.cells.compiled import CompiledMethod, abstract, begin, pack
 from cmedirl_jax.runs.cells.record import Budget, EpisodeRows, EvaluationRows, Record
 from cmedirl_jax.runs.cells.slots import Slots
+from cmedirl_jax.runs.console.phases import phase
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer, Snapshot
 from cmedirl_jax.training import TrainingState
 from cmedirl_jax.training.evaluation import Evaluation
@@ -91,7 +92,8 @@ def train(
             lambda arrays: _saved_like(shapes(), seeds_count, n_demos, arrays)
         )
     if saved is None:
-        state = begin(programs, slots, key, data, n_demos, first_seed)
+        with phase("beginning"):
+            state = jax.block_until_ready(begin(programs, slots, key, data, n_demos, first_seed))
         training = _Training.begin(programs, data, n_demos, budget, slots, state)
     else:
         training = _Training.resume(programs, data, n_demos, budget, slots, shapes(), saved)
@@ -196,12 +198,13 @@ class _Training:
         self.state, groups = pack(self.programs, slots, self.state, active)
         limit = None if budget.max_episodes is None else jnp.int32(budget.max_episodes)
         steps = jnp.arange(self.step, stop, dtype=jnp.int32)
-        self.state, log = self.programs.run(self.state, groups, self.data, steps, limit)
+        with phase("training"):
+            self.state, log = self.programs.run(self.state, groups, self.data, steps, limit)
+            finite, log = self._of_seeds((_finite(self.state), log))
         self.step = stop
 
         # Record what they did, and stop those that diverged.
         was_running = record.running.copy()
-        finite, log = self._of_seeds((_finite(self.state), log))
         record.mark_diverged(finite)
         record.stepped(steps=np.asarray(steps), log=log)
 
@@ -247,8 +250,9 @@ class _Training:
 
     def _evaluate(self, starts: int, groups: int) -> Evaluation:
         evaluator = self.programs.evaluator
-        rollouts = evaluator.on_starts(self.state.agent.actor, starts, groups)
-        return self._of_seeds(evaluator.summarise(rollouts))
+        with phase("evaluation"):
+            rollouts = evaluator.on_starts(self.state.agent.actor, starts, groups)
+            return self._of_seeds(evaluator.summarise(rollouts))
 
 
 def _saved_like(

@@ -16,6 +16,7 @@ from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.cluster.base import ALONE, Cluster
 from cmedirl_jax.runs.config import Expert, ExpertSettings
+from cmedirl_jax.runs.console.phases import phase
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.types import Transition
@@ -91,9 +92,10 @@ def make_pool(
 
     def recorded() -> Demonstrations:
         actors = jax.tree.map(lambda leaf: jnp.asarray(leaf[chosen]), result.final)
-        columns = record_all(actors, jax.random.split(start_key, chosen.size))
-        transition, running, truncated = jax.tree.map(np.asarray, columns)
-        return flatten(transition, running, truncated, metadata)
+        with phase("demonstrations"):
+            columns = record_all(actors, jax.random.split(start_key, chosen.size))
+            transition, running, truncated = jax.tree.map(np.asarray, columns)
+            return flatten(transition, running, truncated, metadata)
 
     pool = cluster.pool_from_writer(recorded)
     assert pool is not None

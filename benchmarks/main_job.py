@@ -1,0 +1,175 @@
+"""`python -m benchmarks.main_job`: how long the main job takes, phase by phase.
+
+The main job is `run_grid` with its defaults. It runs in a process of its own, on every core. Its
+wall time T is compared with a yardstick: a program that takes the same DDPG learning steps on one
+core, at a rate R that is measured before and after. T R / N, with N the job's learning steps, is
+the time that the job takes in units of one core's time for the bare steps.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import re
+import shlex
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich import box
+from rich.table import Table
+
+from benchmarks import measuring, serving
+from cmedirl_jax.runs.config import StudyConfig
+from cmedirl_jax.runs.console import compile_cache, ending, phases, screen
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import outputs
+from cmedirl_jax.training.methods import METHODS
+from experiments import run_grid
+
+_CHILD = "from benchmarks import main_job; main_job.work()"
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to run, and where to write what it took.
+
+    Attributes:
+        rounds: How often to run the job twice: with an empty compile cache (cold), and with the one
+            that this left (warm).
+        yardstick: Command that prints lines with "N steps/s", the last of which counts. It is run
+            on one core, before and after each run.
+        job: Further options of `run_grid`, in one string: --job="--preset smoke".
+        json: File for the measurements.
+    """
+
+    rounds: int = 1
+    yardstick: str | None = None
+    job: str = ""
+    json: Path | None = None
+
+
+@ending.in_a_line("main_job")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the job, and print what it took; returns the exit code."""
+    options = tyro.cli(
+        Options, prog="python -m benchmarks.main_job", description=__doc__, args=arguments
+    )
+    outputs.check("json", options.json)
+    job = shlex.split(options.job)
+    steps = learning_steps(run_grid.parse(job))
+    runs: dict[str, list[dict[str, Any]]] = {"cold": [], "warm": []}
+    for _ in range(options.rounds):
+        with tempfile.TemporaryDirectory() as cache:
+            for measured in runs.values():
+                measured.append(run(job, cache, steps, options.yardstick))
+    if options.json is not None:
+        result = measuring.heading("main_job") | {"learning_steps": steps, "runs": runs}
+        measuring.write(result, options.json)
+    screen.show(screen.console(), table(runs))
+    return 0
+
+
+def learning_steps(config: StudyConfig) -> int:
+    """Learning steps of a run, those of the experts among them."""
+    steps = config.max_steps or 0
+    numbers = [
+        len(config.n_demos) if METHODS[name].uses_demonstrations else 1
+        for name in config.methods
+        if METHODS[name].interacts
+    ]
+    return config.seeds * steps * sum(numbers) + config.experts.seeds * config.experts.steps
+
+
+def run(job: Sequence[str], cache: str, steps: int, yardstick: str | None) -> dict[str, Any]:
+    """Run the job in a process of its own; its seconds, in all and by phase, and its rates.
+
+    Raises:
+        UserError: with the end of what it wrote, if it fails; as `yardstick_rate`.
+    """
+    before = yardstick_rate(yardstick)
+    with tempfile.TemporaryDirectory() as folder:
+        answer = Path(folder) / "answer.json"
+        began = time.perf_counter()
+        done = subprocess.run(
+            [sys.executable, "-c", _CHILD, str(answer), "--out", str(Path(folder) / "out"), *job],
+            env={**os.environ, "JAX_COMPILATION_CACHE_DIR": cache},
+            capture_output=True,
+            text=True,
+        )
+        seconds = time.perf_counter() - began
+        if done.returncode:
+            raise UserError(f"--job: the run failed: {done.stderr[-500:]}")
+        spent = json.loads(answer.read_text())
+    spent["rest"] = seconds - sum(spent.values())
+    result = {
+        "seconds": seconds,
+        "phases": spent,
+        "training_steps_per_second": steps / spent["training"],
+    }
+    if before is not None:
+        rates = [before, yardstick_rate(yardstick)]
+        result["yardstick_steps_per_second"] = rates
+        result["seconds_by_yardstick"] = seconds * statistics.mean(rates) / steps
+    return result
+
+
+def work() -> None:
+    """Be the job's process: `run_grid` with the command line's arguments after the first.
+
+    The first is the file for its seconds by phase.
+    """
+    answer, *job = sys.argv[1:]
+    with phases.counted() as spent, compile_cache.counted() as cost:
+        code = run_grid.main(job)
+    Path(answer).write_text(json.dumps({**spent, "compilation": cost.seconds}))
+    sys.exit(code)
+
+
+def yardstick_rate(command: str | None) -> float | None:
+    """The yardstick's steps per second on one core; None without one.
+
+    Raises:
+        UserError: if it cannot be run, or prints no rate.
+    """
+    if command is None:
+        return None
+    printed = ""
+    with contextlib.suppress(OSError):
+        pinned = serving.pinned(shlex.split(command), measuring.one_core())
+        printed = subprocess.run(pinned, capture_output=True, text=True).stdout
+    rates = re.findall(r"([\d.]+) steps/s", printed)
+    if not rates:
+        raise UserError(f"--yardstick: {command} prints no steps/s; give a command that does")
+    return float(rates[-1])
+
+
+def table(runs: dict[str, list[dict[str, Any]]]) -> Table:
+    """Medians over the rounds: a row for each phase, the rest, all of it, and the rates."""
+    shown = Table(box=box.SIMPLE, title="the main job, seconds")
+    shown.add_column("phase")
+    for kind in runs:
+        shown.add_column(kind, justify="right")
+
+    def row(name: str, form: str, of_run: Callable[[dict[str, Any]], float]) -> None:
+        medians = (statistics.median(map(of_run, measured)) for measured in runs.values())
+        shown.add_row(name, *(form.format(median) for median in medians))
+
+    first = runs["cold"][0]
+    for name in first["phases"]:
+        row(name, "{:.1f}", lambda run, name=name: run["phases"].get(name, 0.0))
+    row("all", "{:.1f}", lambda run: run["seconds"])
+    row("learning steps/s while training", "{:,.0f}", lambda run: run["training_steps_per_second"])
+    if "seconds_by_yardstick" in first:
+        row("T R / N", "{:.2f}", lambda run: run["seconds_by_yardstick"])
+    return shown
+
+
+if __name__ == "__main__":
+    sys.exit(main())
