@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from benchmarks import (
     checkpoint_cost,
+    main_job,
     measuring,
     naive,
     ours,
@@ -27,9 +28,11 @@ from benchmarks.peers import PEERS
 from benchmarks.serving import Worker
 from benchmarks.workload import Workload
 from cmedirl_jax.runs.cells import compiled as compiled_lib
+from cmedirl_jax.runs.console import phases
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import checkpoints
 from cmedirl_jax.training.methods import PAPER_METHODS
+from experiments import run_grid
 from tests.support import pools
 
 TINY = {"seeds": 3, "hidden": (4, 4), "batch": 4}
@@ -358,3 +361,74 @@ def test_checkpoints_are_counted_and_their_cost_is_of_the_time_without(fake_trai
 def test_a_run_too_short_for_a_checkpoint_says_so(fake_training):
     with pytest.raises(UserError, match=r"--every: none was due .* ask for more --steps"):
         checkpoint_cost.measure(checkpoint_cost.Options(every=60.0), compiled=None)
+
+
+def test_the_main_jobs_learning_steps_are_those_of_all_its_seeds():
+    assert main_job.learning_steps(run_grid.parse([])) == 4 * 100 * 12_000 + 16 * 14_000
+    job = ["--methods", "ddpg", "hs-ddpg", "bc", "--n-demos", "1", "5", "--seeds", "7"]
+    assert main_job.learning_steps(run_grid.parse(job)) == 3 * 7 * 12_000 + 16 * 14_000
+
+
+def test_a_yardsticks_last_rate_counts():
+    command = f"{sys.executable} -c \"print('4 steps/s'); print('x: 31500.5 steps/s (32 us)')\""
+    assert main_job.yardstick_rate(command) == 31500.5
+    assert main_job.yardstick_rate(None) is None
+
+
+@pytest.mark.parametrize("command", ["true", "/no/such/program"])
+def test_a_yardstick_without_a_rate_is_refused(command):
+    with pytest.raises(UserError, match=f"--yardstick: {command} prints no steps/s"):
+        main_job.yardstick_rate(command)
+
+
+CHILD = """
+import json, os, pathlib, sys
+assert sys.argv[2] == "--out" and sys.argv[4:] == ["--seeds", "3"], sys.argv
+cache = pathlib.Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
+warm = (cache / "entry").exists()
+(cache / "entry").touch()
+spent = {"training": 0.02, "compilation": 0.001 if warm else 0.003}
+pathlib.Path(sys.argv[1]).write_text(json.dumps(spent))
+"""
+
+
+def test_the_main_job_runs_cold_and_warm(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(main_job, "_CHILD", CHILD)
+    yardstick = f"{sys.executable} -c \"print('1000 steps/s')\""
+    options = ["--rounds", "2", "--job=--seeds 3", "--yardstick", yardstick]
+    assert main_job.main([*options, "--json", str(tmp_path / "job.json")]) == 0
+    result = json.loads((tmp_path / "job.json").read_text())
+    steps = 4 * 3 * 12_000 + 16 * 14_000
+    assert result["learning_steps"] == steps
+    for kind, compilation in (("cold", 0.003), ("warm", 0.001)):
+        assert len(result["runs"][kind]) == 2
+        for run in result["runs"][kind]:
+            assert run["phases"]["compilation"] == compilation
+            assert run["seconds"] == pytest.approx(sum(run["phases"].values()))
+            assert run["training_steps_per_second"] == steps / 0.02
+            assert run["seconds_by_yardstick"] == pytest.approx(run["seconds"] * 1000 / steps)
+    printed = capsys.readouterr().out
+    assert "T R / N" in printed
+    assert "compilation" in printed
+
+
+def test_a_main_job_that_fails_says_why(monkeypatch, capsys):
+    monkeypatch.setattr(main_job, "_CHILD", "import sys; sys.exit('no such option')")
+    assert main_job.main([]) == 2
+    assert "main_job: --job: the run failed: no such option" in capsys.readouterr().err
+
+
+def test_the_main_jobs_process_writes_its_phases(monkeypatch, tmp_path):
+    def run(job):
+        assert job == ["--seeds", "3"]
+        with phases.phase("training"):
+            time.sleep(0.01)
+        return 0
+
+    monkeypatch.setattr(run_grid, "main", run)
+    monkeypatch.setattr(sys, "argv", ["-c", str(tmp_path / "answer"), "--seeds", "3"])
+    with pytest.raises(SystemExit, match="0"):
+        main_job.work()
+    spent = json.loads((tmp_path / "answer").read_text())
+    assert spent["training"] >= 0.01
+    assert spent["compilation"] == 0.0

@@ -1,0 +1,63 @@
+import jax
+import numpy as np
+import pytest
+
+from cmedirl_jax import training
+from cmedirl_jax.runs.cells import compiled as compiled_lib
+from cmedirl_jax.runs.cells.slots import Slots
+from cmedirl_jax.training import seeds
+from cmedirl_jax.training.methods import METHODS
+from tests.support.trainers import ENV, SMALL, data
+
+SEEDS, KEY = 3, jax.random.key(3)
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    return compiled_lib.compiler(ENV, jax.devices()[:1], capacity=50, subset_size=3, group=2)
+
+
+def begin(compiled, method, n_demos=2, first_seed=0, pool=None):
+    programs = compiled(METHODS[method], SMALL, SEEDS)
+    slots = Slots(programs.slots, SEEDS, programs.group, programs.devices)
+    pool = data() if pool is None else pool
+    state = compiled_lib.begin(programs, slots, KEY, pool, n_demos, first_seed)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[slots.of_seed], state.agent.actor)
+
+
+def test_methods_share_one_hot_start(compiled, monkeypatch):
+    shared = compiled(METHODS["hs-ddpg"], SMALL, SEEDS).hot_start
+    assert compiled(METHODS["ddpg"], SMALL, SEEDS).hot_start is None
+    calls, fit = [], shared._fit
+    monkeypatch.setattr(shared, "_fit", lambda *args: calls.append(args) or fit(*args))
+    actors = [begin(compiled, method) for method in ("hs-ddpg", "hs-me-ddpg", "bc")]
+    assert len(calls) == 1
+    for actor in actors[1:]:
+        jax.tree.map(np.testing.assert_array_equal, actor, actors[0])
+    # Whatever else it is asked, it answers anew.
+    begin(compiled, "bc", n_demos=3)
+    begin(compiled, "bc", n_demos=3, first_seed=1)
+    begin(compiled, "bc", n_demos=3, first_seed=1, pool=jax.tree.map(lambda leaf: leaf, data()))
+    assert len(calls) == 4
+
+
+@pytest.mark.parametrize("method", ["ddpg", "hs-me-ddpg"])
+def test_seeds_begin_as_the_trainer_lets_them(compiled, method):
+    actor = begin(compiled, method, first_seed=1)
+    trainer = training.make(ENV, METHODS[method], SMALL, capacity=50, subset_size=3)
+    alone = jax.jit(lambda key: trainer.init(key, data(), 2).agent.actor)
+    for seed, key in enumerate(seeds.keys(KEY, SEEDS + 1)[1:]):
+        one = jax.tree.map(lambda leaf, seed=seed: leaf[seed], actor)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-4), one, alone(key))
+
+
+@pytest.mark.parametrize("method", ["ddpg", "hs-me-ddpg"])
+def test_shapes_are_those_of_the_beginning(compiled, method):
+    programs = compiled(METHODS[method], SMALL, SEEDS)
+    slots = Slots(programs.slots, SEEDS, programs.group, programs.devices)
+    state = compiled_lib.begin(programs, slots, KEY, data(), 2)
+    jax.tree.map(
+        lambda shape, leaf: (shape.shape, shape.dtype) == (leaf.shape, leaf.dtype) or pytest.fail(),
+        compiled_lib.abstract(programs, data(), 2),
+        state,
+    )
