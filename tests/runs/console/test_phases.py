@@ -37,7 +37,10 @@ def test_nothing_is_counted_outside_or_after_a_failure():
         pass
     with phases.phase("training"):
         pass
-    with phases.counted() as failed, pytest.raises(ValueError, match="told"):
-        with phases.phase("training"):
-            raise ValueError("told")
+    with (
+        phases.counted() as failed,
+        pytest.raises(ValueError, match="told"),
+        phases.phase("training"),
+    ):
+        raise ValueError("told")
     assert spent == failed == {}
