@@ -7,6 +7,7 @@ import itertools
 import json
 import os
 import platform
+import shlex
 import statistics
 import sys
 from collections.abc import Sequence
@@ -150,7 +151,7 @@ def one_core() -> list[int] | None:
 def heading(program: str) -> dict[str, Any]:
     """The first fields of every file of measurements."""
     return {
-        "command": f"python -m benchmarks.{program} " + " ".join(sys.argv[1:]),
+        "command": f"python -m benchmarks.{program} " + shlex.join(sys.argv[1:]),
         "date": datetime.date.today().isoformat(),
         "machine": machine(),
         "versions": versions(),
