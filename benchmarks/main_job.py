@@ -128,7 +128,7 @@ def work() -> None:
     answer, *job = sys.argv[1:]
     with phases.counted() as spent, compile_cache.counted() as cost:
         code = run_grid.main(job)
-    Path(answer).write_text(json.dumps({**spent, "compilation": cost.seconds}))
+    measuring.write({**spent, "compilation": cost.seconds}, Path(answer))
     sys.exit(code)
 
 
