@@ -107,13 +107,14 @@ def draw(
         chosen = rows[:0]
         if sampler is not None and subset is not None:
             chosen = sampler.choose(jax.random.fold_in(key, 4), subset, rows, sampled)
-        return SampleDraws(replay.draw(background_key, sampled), chosen), rows[:cloned]
+        drawn = SampleDraws(replay.draw(background_key, sampled), chosen), rows[:cloned]
+        return modes.vary(drawn, key, subset)
 
     shapes = jax.eval_shape(draw_demonstrated)
-    zeros = modes.vary(
-        jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes), key, subset
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    reward, cloning = jax.lax.cond(
+        demonstrated, draw_demonstrated, lambda: modes.vary(zeros, key, subset)
     )
-    reward, cloning = jax.lax.cond(demonstrated, draw_demonstrated, lambda: zeros)
     return UpdateDraws(
         batch=replay.draw(batch_key, parts.batch_size),
         reward=reward,
