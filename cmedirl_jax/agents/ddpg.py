@@ -280,16 +280,13 @@ def _update_actor(
 ) -> tuple[DDPGState, jax.Array]:
     """Take a gradient step of the actor; also its loss, before it."""
     gradient = functools.partial(_actor_gradient, parts.networks, state, batch)
-    if demonstrations is None:
-        (loss, actor), grads = gradient(state.actor, None)
-    else:
-        # A branch of its own, so that the term costs nothing once it has faded out.
-        (loss, actor), grads = _when(
-            clone,
-            lambda actor: gradient(actor, demonstrations),
-            lambda actor: gradient(actor, None),
-            state.actor,
-        )
+    # A branch of its own, so that the cloning term costs nothing once it has faded out.
+    (loss, actor), grads = _when(
+        demonstrations is not None and clone,
+        lambda actor: gradient(actor, demonstrations),
+        lambda actor: gradient(actor, None),
+        state.actor,
+    )
     updates, optimizer = parts.actor_optimizer.update(
         grads, state.actor_optimizer, actor, learning_rate=state.hparams.actor_learning_rate
     )

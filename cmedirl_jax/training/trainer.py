@@ -22,7 +22,6 @@ import jax.numpy as jnp
 from cmedirl_jax import envs
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.agents.hot_start import HotStartData
-from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.envs import Env
 from cmedirl_jax.training import compose, initialise, schedules, updates
 from cmedirl_jax.training import step as step_lib
@@ -46,8 +45,9 @@ class Trainer(NamedTuple):
         draw_networks: see `initialise.Initialisation`.
         hot_start: likewise.
         init: likewise.
-        draw: `(key, subset, step) -> StepDraws`, of environment step number `step` `[]` int32 of
-            the seed whose state has this `key` and this `subset`.
+        draw: `(key, subset, step, demonstrated=True) -> StepDraws`, of environment step number
+            `step` `[]` int32 of the seed whose state has this `key` and this `subset`. Steps that
+            learn nothing from demonstrations may say so by `demonstrated`, which spares the draws.
         plan: `(step) -> Plan`, what that step does.
         behave: `(state, draws, plan) -> Behaviour`, the first half of a step.
         learn: `(state, behaviour, answer, next_start, draws, plan, pool, max_episodes=None) ->
@@ -65,7 +65,7 @@ class Trainer(NamedTuple):
     draw_networks: Callable[[jax.Array], tuple[Params, Params]]
     hot_start: Callable[..., tuple[Params, Params]]
     init: Callable[..., TrainingState]
-    draw: Callable[[jax.Array, DemonstrationSubset | None, jax.Array], StepDraws]
+    draw: Callable[..., StepDraws]
     plan: Callable[[jax.Array], Plan]
     behave: Callable[[TrainingState, StepDraws, Plan], Behaviour]
     learn: Callable[..., tuple[TrainingState, Log]]
