@@ -21,16 +21,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import polars as pl
 import tyro
 from rich import box
 from rich.table import Table
 
 from benchmarks import measuring, serving
-from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.console import compile_cache, ending, phases, screen
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
-from cmedirl_jax.training.methods import METHODS
 from experiments import run_grid
 
 _CHILD = "from benchmarks import main_job; main_job.work()"
@@ -63,31 +62,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     outputs.check("json", options.json)
     job = shlex.split(options.job)
-    steps = learning_steps(run_grid.parse(job))
+    # Refuse a wrong option before anything is run.
+    run_grid.parse(job)
     runs: dict[str, list[dict[str, Any]]] = {"cold": [], "warm": []}
     for _ in range(options.rounds):
         with tempfile.TemporaryDirectory() as cache:
             for measured in runs.values():
-                measured.append(run(job, cache, steps, options.yardstick))
+                measured.append(run(job, cache, options.yardstick))
     if options.json is not None:
-        result = measuring.heading("main_job") | {"learning_steps": steps, "runs": runs}
+        result = measuring.heading("main_job") | {"runs": runs}
         measuring.write(result, options.json)
     screen.show(screen.console(), table(runs))
     return 0
 
 
-def learning_steps(config: StudyConfig) -> int:
-    """Learning steps of a run, those of the experts among them."""
-    steps = config.max_steps or 0
-    numbers = [
-        len(config.n_demos) if METHODS[name].uses_demonstrations else 1
-        for name in config.methods
-        if METHODS[name].interacts
-    ]
-    return config.seeds * steps * sum(numbers) + config.experts.seeds * config.experts.steps
+def learning_steps(seeds: pl.DataFrame, *, trains_experts: bool) -> int:
+    """Learning steps that a run took, by its table of seeds, those of the experts among them."""
+    experts = seeds["expert_steps"].max() if trains_experts else 0
+    return int(seeds["env_steps"].sum()) + int(experts or 0)  # pyright: ignore[reportArgumentType]
 
 
-def run(job: Sequence[str], cache: str, steps: int, yardstick: str | None) -> dict[str, Any]:
+def run(job: Sequence[str], cache: str, yardstick: str | None) -> dict[str, Any]:
     """Run the job in a process of its own; its seconds, in all and by phase, and its rates.
 
     Raises:
@@ -95,10 +90,10 @@ def run(job: Sequence[str], cache: str, steps: int, yardstick: str | None) -> di
     """
     before = yardstick_rate(yardstick)
     with tempfile.TemporaryDirectory() as folder:
-        answer = Path(folder) / "answer.json"
+        answer, out = Path(folder) / "answer.json", Path(folder) / "out"
         began = time.perf_counter()
         done = subprocess.run(
-            [sys.executable, "-c", _CHILD, str(answer), "--out", str(Path(folder) / "out"), *job],
+            [sys.executable, "-c", _CHILD, str(answer), *job, "--out", str(out)],
             env={**os.environ, "JAX_COMPILATION_CACHE_DIR": cache},
             capture_output=True,
             text=True,
@@ -107,9 +102,12 @@ def run(job: Sequence[str], cache: str, steps: int, yardstick: str | None) -> di
         if done.returncode:
             raise UserError(f"--job: the run failed: {done.stderr[-500:]}")
         spent = json.loads(answer.read_text())
+        seeds = pl.read_parquet(out / "seeds.parquet")
+    steps = learning_steps(seeds, trains_experts=run_grid.parse(job).demos is None)
     spent["rest"] = seconds - sum(spent.values())
     result = {
         "seconds": seconds,
+        "learning_steps": steps,
         "phases": spent,
         "training_steps_per_second": steps / spent["training"],
     }

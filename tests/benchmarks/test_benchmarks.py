@@ -8,6 +8,7 @@ import types
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -364,9 +365,24 @@ def test_a_run_too_short_for_a_checkpoint_says_so(fake_training):
 
 
 def test_the_main_jobs_learning_steps_are_those_of_all_its_seeds():
-    assert main_job.learning_steps(run_grid.parse([])) == 4 * 100 * 12_000 + 16 * 14_000
-    job = ["--methods", "ddpg", "hs-ddpg", "bc", "--n-demos", "1", "5", "--seeds", "7"]
-    assert main_job.learning_steps(run_grid.parse(job)) == 3 * 7 * 12_000 + 16 * 14_000
+    def seeds(cells, count, ended=12_000):
+        steps = [ended] * count
+        # A method without demonstrations, those with, and one that does not interact.
+        return pl.DataFrame(
+            {
+                "env_steps": steps * cells + [0] * count,
+                "expert_steps": [0] * count + [16 * 14_000] * count * cells,
+            }
+        )
+
+    whole = 4 * 100 * 12_000 + 16 * 14_000
+    assert main_job.learning_steps(seeds(4, 100), trains_experts=True) == whole
+    fewer = 3 * 7 * 12_000
+    assert main_job.learning_steps(seeds(3, 7), trains_experts=True) == fewer + 16 * 14_000
+    # A file of demonstrations tells of its experts, who are not trained again.
+    assert main_job.learning_steps(seeds(3, 7), trains_experts=False) == fewer
+    # By episodes, seeds end when they have lived theirs.
+    assert main_job.learning_steps(seeds(3, 7, 900), trains_experts=False) == 3 * 7 * 900
 
 
 def test_a_yardsticks_last_rate_counts():
@@ -383,7 +399,11 @@ def test_a_yardstick_without_a_rate_is_refused(command):
 
 CHILD = """
 import json, os, pathlib, sys
-assert sys.argv[2] == "--out" and sys.argv[4:] == ["--seeds", "3"], sys.argv
+import polars as pl
+assert sys.argv[2:5] == ["--seeds", "3", "--out"] and len(sys.argv) == 6, sys.argv
+pathlib.Path(sys.argv[5]).mkdir()
+seeds = {"env_steps": [12_000] * 12, "expert_steps": [0] * 3 + [16 * 14_000] * 9}
+pl.DataFrame(seeds).write_parquet(pathlib.Path(sys.argv[5]) / "seeds.parquet")
 cache = pathlib.Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
 warm = (cache / "entry").exists()
 (cache / "entry").touch()
@@ -399,10 +419,10 @@ def test_the_main_job_runs_cold_and_warm(monkeypatch, tmp_path, capsys):
     assert main_job.main([*options, "--json", str(tmp_path / "job.json")]) == 0
     result = json.loads((tmp_path / "job.json").read_text())
     steps = 4 * 3 * 12_000 + 16 * 14_000
-    assert result["learning_steps"] == steps
     for kind, compilation in (("cold", 0.003), ("warm", 0.001)):
         assert len(result["runs"][kind]) == 2
         for run in result["runs"][kind]:
+            assert run["learning_steps"] == steps
             assert run["phases"]["compilation"] == compilation
             assert run["seconds"] == pytest.approx(sum(run["phases"].values()))
             assert run["training_steps_per_second"] == steps / 0.02
