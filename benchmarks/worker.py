@@ -12,7 +12,7 @@ from benchmarks.serving import serve
 from benchmarks.workload import Workload
 from cmedirl_jax import envs
 from cmedirl_jax.data.demonstrations import Demonstrations
-from cmedirl_jax.runs.cells import experts
+from cmedirl_jax.runs.cells import recording
 from cmedirl_jax.runs.console import compile_cache
 
 
@@ -23,9 +23,9 @@ def demonstrations(episodes: int) -> Demonstrations:
     def act(actor: None, observation: jax.Array) -> jax.Array:
         return 0.8 * jnp.sign(observation[..., 1:])
 
-    record = jax.jit(lambda key: experts.record(act, env, None, key, episodes))
-    transition, running, truncated = jax.device_get(record(jax.random.key(1)))
-    return experts.flatten(transition, running, truncated, {"env": env.spec.id})
+    record = jax.jit(lambda key: recording.record(act, env, None, key, episodes))
+    recorded = recording.flatten(*jax.device_get(record(jax.random.key(1))))
+    return recording.joined([recorded], {"env": env.spec.id})
 
 
 def main() -> None:

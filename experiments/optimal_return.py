@@ -40,7 +40,7 @@ class Options:
         states: Points along each dimension of the observation, a grid for each.
         actions: Points along each dimension of the action.
         discount: The agent's; the undiscounted optimum is computed too.
-        starts: Start states, evenly spaced, as in the evaluations of `tuned`.
+        starts: Start states, those of the evaluations of `tuned`.
         out: A CSV file for the table of all starts.
     """
 

@@ -177,12 +177,10 @@ def discounted_returns(demonstrations: Demonstrations, discount: float) -> np.nd
         ValueError: if the discount is not between 0 and 1.
     """
     checks.shares(discount=discount)
-    reward = np.asarray(demonstrations.transition.reward, np.float64)
-    episode = np.asarray(demonstrations.episode)
-    result = np.empty_like(reward)
-    following = 0.0
-    for t in range(reward.size - 1, -1, -1):
-        if t + 1 < reward.size and episode[t + 1] != episode[t]:
-            following = 0.0
-        following = result[t] = reward[t] + discount * following
+    result = np.array(demonstrations.transition.reward, np.float64)
+    start, length = episodes(demonstrations)
+    # All episodes at once, from their last steps backwards.
+    for t in range(int(length.max()) - 2, -1, -1):
+        at = start[length > t + 1] + t
+        result[at] += discount * result[at + 1]
     return result.astype(np.float32)

@@ -51,7 +51,7 @@ class Env(NamedTuple):
         reset: see `ResetFn`.
         step: see `StepFn`.
         starts: `(count, params) -> (states [count], observations [count, O])`, fixed start states
-            for evaluation, evenly spread over the start distribution.
+            for evaluation, which weigh as `reset` draws them.
         state_at: `(observation [O], params) -> state`, the state with that observation, at step 0
             of an episode; None if an observation does not determine the state.
     """

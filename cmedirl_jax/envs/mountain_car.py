@@ -88,10 +88,12 @@ def reset(key: jax.Array, params: MountainCarParams) -> tuple[MountainCarState, 
 
 
 def starts(count: int, params: MountainCarParams) -> tuple[MountainCarState, jax.Array]:
-    """`count` start states at rest, evenly spaced over the start interval, its ends included."""
-    return jax.vmap(_at_rest)(
-        jnp.linspace(params.start_low, params.start_high, count, dtype=jnp.float32)
-    )
+    """`count` start states at rest, the midpoints of as many equal parts of the start interval.
+
+    Their mean weighs the interval as `reset` draws it. Its ends would weigh too much.
+    """
+    share = (jnp.arange(count, dtype=jnp.float32) + 0.5) / count
+    return jax.vmap(_at_rest)(params.start_low + share * (params.start_high - params.start_low))
 
 
 def step(

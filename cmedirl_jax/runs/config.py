@@ -3,7 +3,7 @@
 import dataclasses
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import tyro
 
@@ -12,7 +12,7 @@ from cmedirl_jax.runs.cluster.base import ClusterOptions
 from cmedirl_jax.training.methods import PAPER_METHODS
 from cmedirl_jax.training.settings import Settings
 
-Expert = Literal["best", "median", "all"]
+Expert = Literal["each", "best", "median", "all"]
 DemosCheck = Literal["dynamics", "spec", "none"]
 
 
@@ -22,13 +22,31 @@ class ExpertSettings:
 
     Attributes:
         seeds: Experts trained; the final policies of those that solve the task can demonstrate.
+            Default: one for each learner, or 16 where learners share an expert.
         steps: Environment steps of each expert.
-        trajectories: Least number of demonstrated trajectories in the pool.
+        trajectories: Trajectories that a learner draws its demonstrations from, at least. Default:
+            200 of its own expert, or 1,024 that all share; more if n-demos asks for more.
     """
 
-    seeds: Size = 16
+    seeds: Size | None = None
     steps: Size = 14_000
-    trajectories: Size = 1_024
+    trajectories: Size | None = None
+
+
+class Experts(NamedTuple):
+    """Who demonstrates in a run, and how they are made, with every default filled in.
+
+    Attributes:
+        which: who demonstrates.
+        seeds: experts trained.
+        steps: environment steps of each.
+        trajectories: that a learner draws its demonstrations from, at least.
+    """
+
+    which: Expert
+    seeds: int
+    steps: int
+    trajectories: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,14 +64,14 @@ class StudyConfig:
         max_steps: Environment steps per learner.
         max_episodes: Episodes per learner; with max-steps, whichever comes first.
         evaluate_every: Environment steps between noise-free evaluations.
-        evaluation_starts: Start states per evaluation, evenly spaced, the same for every seed and
-            method.
+        evaluation_starts: Start states per evaluation, the same for every seed and method; they
+            weigh as the task draws them.
         evaluate_every_episodes: Also evaluate each learner whenever it has lived this many more
             episodes (the paper: 100).
         evaluation_starts_episodes: Start states of the evaluations by episodes.
         out: Folder of the results; default results/PRESET.
-        expert: Who demonstrates: the best or median expert that solved the task, or all of them
-            alike.
+        expert: Who demonstrates: each learner has an expert of its own, or all share the best one
+            that solved the task, the median one, or all of them alike.
         demos: A demonstrations file to learn from; no experts are trained, and their options are
             not read.
         check_demos: What is asked of that file. dynamics: that each step is the task's own, where
@@ -86,7 +104,7 @@ class StudyConfig:
     evaluate_every_episodes: Size | None = None
     evaluation_starts_episodes: Size = 100
     out: Path | None = None
-    expert: Expert = "best"
+    expert: Expert = "each"
     demos: Path | None = None
     check_demos: DemosCheck = "dynamics"
     env: str = "MountainCarContinuous-v0"
@@ -99,6 +117,17 @@ class StudyConfig:
     checkpoint_every: NotNegative = 60.0
     experts: ExpertSettings = ExpertSettings()
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
+
+    @property
+    def resolved_experts(self) -> Experts:
+        """Who demonstrates; the defaults depend on whether each learner has its own expert."""
+        each = self.expert == "each"
+        return Experts(
+            self.expert,
+            self.experts.seeds or (self.seeds if each else 16),
+            self.experts.steps,
+            self.experts.trajectories or max(200 if each else 1_024, *self.n_demos),
+        )
 
     @property
     def folder(self) -> Path:

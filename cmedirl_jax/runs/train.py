@@ -9,8 +9,6 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from cmedirl_jax.agents import hot_start
-from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.runs import numerics
 from cmedirl_jax.runs.cells import cell as cell_lib
@@ -19,6 +17,7 @@ from cmedirl_jax.runs.cells import experts, gymnasium_replay, tabular_cell
 from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.evaluator import Evaluator
+from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.cluster.base import Cluster
 from cmedirl_jax.runs.console import screen
 from cmedirl_jax.runs.console.phases import phase
@@ -66,18 +65,6 @@ class Cell(NamedTuple):
         if self.block.start:
             seeds = f"seeds {self.block.start} to {self.block.stop - 1}"
         return f"{cells.stem(self.method.name, self.n_demos)}, {seeds}"
-
-
-class _Pool(NamedTuple):
-    """The demonstrations as cells use them.
-
-    Attributes:
-        data: for the learners; None if no cell needs any.
-        metadata: of the pool.
-    """
-
-    data: HotStartData | None
-    metadata: dict[str, Any]
 
 
 class Session(NamedTuple):
@@ -151,8 +138,7 @@ def train_cells(session: Session, todo: Sequence[Cell]) -> None:
     stored = cluster.pool_from_writer(load_stored)
     pool = stored if plan.demos is None else plan.demos
     trains_experts = pool is None and any(cell.n_demos for cell in todo)
-    if pool is not None:
-        plan.check_enough(pool)
+    used = None if pool is None else plan.of_learners(pool)
     steps = sum(len(cell.block) * plan.budget.max_steps for cell in todo if cell.method.interacts)
     steps += plan.experts.seeds * plan.experts.steps * trains_experts
 
@@ -162,16 +148,11 @@ def train_cells(session: Session, todo: Sequence[Cell]) -> None:
             report.start(f"experts, {plan.experts.seeds} seeds")
             with session.checkpointer(EXPERTS) as checkpointer:
                 pool = _train_experts(session, checkpointer, report)
-            plan.check_enough(pool)
+            used = plan.of_learners(pool)
         if pool is not None and stored is None and cluster.writer:
             stored_demonstrations.save(plan.folder, pool)
         if pool is not None and cluster.writer:
             run_folder.remove_checkpoints(plan.folder, [EXPERTS])
-        used = _Pool(None, {})
-        if pool is not None:
-            agent = plan.settings.agent
-            data = hot_start.data(pool, agent.discount, agent.reward_scale)
-            used = _Pool(data, pool.metadata)
         for cell in todo:
             if session.interruption.came():
                 session.interruption.stop()
@@ -188,8 +169,8 @@ def _train_experts(
         session.keys.experts,
         plan.env,
         plan.experts,
-        plan.expert,
         session.compiled(METHODS["ddpg"], Settings(), plan.seeds),
+        plan.budget.evaluation_starts,
         _stepwise(report, plan.experts.seeds),
         checkpointer,
         session.cluster,
@@ -197,7 +178,11 @@ def _train_experts(
 
 
 def _train_cell(
-    session: Session, checkpointer: Checkpointer, cell: Cell, pool: _Pool, report: Reporter
+    session: Session,
+    checkpointer: Checkpointer,
+    cell: Cell,
+    pool: LearnersPool | None,
+    report: Reporter,
 ) -> None:
     """Train a cell, evaluate its best policies, and save it."""
     result, evaluator = _train(session, checkpointer, cell, pool, report)
@@ -211,10 +196,10 @@ def _train_cell(
         replay = gymnasium_replay.replay(evaluator, result.best, plan.env)
 
     # Save.
-    metadata: dict[str, Any] = pool.metadata if cell.n_demos else {"expert": "none"}
+    demonstrated = pool if cell.n_demos else None
     key = CellKey(
         study=plan.study,
-        expert=metadata.get("expert", "file"),
+        expert="none" if demonstrated is None else demonstrated.metadata.get("expert", "file"),
         method=cell.method.name,
         n_demos=cell.n_demos,
         first_seed=cell.block.start,
@@ -225,7 +210,7 @@ def _train_cell(
         key,
         best_return=np.asarray(best_return),
         replay=replay,
-        expert_steps=metadata.get("expert_env_steps", 0),
+        pool=demonstrated,
     )
     if session.cluster.writer:
         checkpointer.wait()
@@ -242,14 +227,18 @@ def _train_cell(
 
 
 def _train(
-    session: Session, checkpointer: Checkpointer, cell: Cell, pool: _Pool, report: Reporter
+    session: Session,
+    checkpointer: Checkpointer,
+    cell: Cell,
+    pool: LearnersPool | None,
+    report: Reporter,
 ) -> tuple[CellResult, Evaluator]:
     """Train a cell; gives its evaluator too."""
     plan, key, budget = session.plan, session.keys.learners, session.plan.budget
     seeds = {"seeds_count": len(cell.block), "first_seed": cell.block.start}
     if cell.method.tabular is not None and not cell.method.interacts:
         fit = session.compiled_fit(cell.method)
-        assert pool.data is not None
+        assert pool is not None
         result = tabular_cell.train(
             fit,
             key,
@@ -264,7 +253,7 @@ def _train(
     result = cell_lib.train(
         programs,
         key,
-        pool.data if cell.n_demos else None,
+        pool.data if pool is not None and cell.n_demos else None,
         cell.n_demos,
         **seeds,
         budget=budget if cell.method.interacts else dataclasses.replace(budget, max_steps=0),

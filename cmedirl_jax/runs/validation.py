@@ -14,9 +14,11 @@ from cmedirl_jax.agents.exploration import ExplorationSettings
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
+from cmedirl_jax.runs.cells import pools
+from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.cluster.base import ALONE, Cluster
-from cmedirl_jax.runs.config import DemosCheck, Expert, ExpertSettings, StudyConfig
+from cmedirl_jax.runs.config import DemosCheck, Experts, StudyConfig
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import cells, plain
 from cmedirl_jax.tabular import imitation
@@ -43,8 +45,7 @@ class Plan(NamedTuple):
         group: seeds that a device steps together; None: what is fastest.
         checkpoint_every: seconds from one checkpoint to the next.
         demos: the demonstrations that the user gave, or None.
-        experts: how demonstrations are made if none were given.
-        expert: which of the experts demonstrate.
+        experts: who demonstrates if none were given.
     """
 
     folder: Path
@@ -59,8 +60,7 @@ class Plan(NamedTuple):
     group: int | None
     checkpoint_every: float
     demos: Demonstrations | None
-    experts: ExpertSettings
-    expert: Expert
+    experts: Experts
 
     @property
     def capacity(self) -> int:
@@ -68,13 +68,21 @@ class Plan(NamedTuple):
         steps = self.budget.max_steps
         return steps if self.demos is not None else max(steps, self.experts.steps)
 
-    def check_enough(self, pool: Demonstrations) -> None:
-        """Refuse to draw more demonstrations than the pool holds.
+    def of_learners(self, pool: Demonstrations) -> LearnersPool:
+        """Share a pool among the run's learners.
 
         Raises:
-            UserError: saying how many there are.
+            UserError: if it holds too few demonstrations, or has experts for fewer learners.
         """
-        _check_enough(self.asked, _held(pool))
+        agent = self.settings.agent
+        try:
+            shared = pools.of_learners(pool, self.seeds, agent.discount, agent.reward_scale)
+        except ValueError as error:
+            raise UserError(
+                f"--seeds: {self.folder / 'demonstrations'}: {error}; give another folder to --out"
+            ) from error
+        _check_enough(self.asked, shared.data.episodes.start.shape[1])
+        return shared
 
 
 def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool = False) -> Plan:
@@ -94,7 +102,7 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool =
     if path is not None:
         demos = cluster.pool_from_writer(lambda: load_demonstrations(path, env, config.check_demos))
         assert demos is not None
-        held = _held(demos)
+        held = _held(path, demos, config.seeds)
         if fewer_will_do and held < max(config.n_demos):
             config = dataclasses.replace(config, n_demos=(held,))
         _check_enough(cells.asked(config.methods, config.n_demos), held)
@@ -111,8 +119,7 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool =
         group=config.group,
         checkpoint_every=config.checkpoint_every,
         demos=demos,
-        experts=config.experts,
-        expert=config.expert,
+        experts=config.resolved_experts,
     )
 
 
@@ -174,7 +181,13 @@ def check(config: StudyConfig) -> None:
     _check_parts(config, env, capacity)
     if config.demos is None:
         asked = cells.asked(config.methods, config.n_demos)
-        _check_enough(asked, config.experts.trajectories)
+        experts = config.resolved_experts
+        _check_enough(asked, experts.trajectories)
+        if experts.which == "each" and experts.seeds < config.seeds:
+            raise UserError(
+                f"--experts.seeds: {experts.seeds} experts are too few for {config.seeds} learners "
+                "with one each; give as many, or another --expert"
+            )
 
 
 def _check_parts(config: StudyConfig, env: Env, capacity: int) -> None:
@@ -275,8 +288,12 @@ def load_demonstrations(path: Path, env: Env, check: DemosCheck) -> Demonstratio
     return pool
 
 
-def _held(pool: Demonstrations) -> int:
-    return int(pool.episode[-1]) + 1
+def _held(path: Path, pool: Demonstrations, learners: int) -> int:
+    """How many demonstrations each learner may draw from."""
+    try:
+        return pools.of_learners(pool, learners).data.episodes.start.shape[1]
+    except ValueError as error:
+        raise UserError(f"--demos: {path}: {error}") from error
 
 
 def _check_enough(asked: Sequence[tuple[str, int]], held: int) -> None:

@@ -233,15 +233,17 @@ def visitation(
     drawn = jnp.searchsorted(pool.start, chosen.start)
     there = (chosen.length > 0).astype(mdp.reward.dtype)
     weight = jnp.zeros(pool.start.shape, there.dtype).at[drawn].add(there / jnp.sum(there))
+    # Rows of the pool outside its `episodes` weigh nothing.
     row = jnp.arange(data.transition.reward.shape[0])
-    episode = jnp.searchsorted(pool.start, row, side="right") - 1
+    episode = jnp.maximum(jnp.searchsorted(pool.start, row, side="right") - 1, 0)
     time = row - pool.start[episode]
+    weight = jnp.where((time >= 0) & (time < pool.length[episode]), weight[episode], 0.0)
     state, state_weight = interpolation.interpolate(mdp.states, data.transition.observation)
     action, action_weight = interpolation.interpolate(mdp.actions, data.transition.action)
     discounts = jnp.asarray(discount**time, weight.dtype)
-    visits = (weight[episode] * discounts)[:, None] * state_weight  # [N, 2^O]
+    visits = (weight * discounts)[:, None] * state_weight  # [N, 2^O]
     both = visits[:, :, None] * action_weight[:, None, :]
-    starts = jnp.where(time == 0, weight[episode], 0.0)[:, None] * state_weight
+    starts = jnp.where(time == 0, weight, 0.0)[:, None] * state_weight
     empty = jnp.zeros_like(mdp.reward)
     return TabularDemonstrations(
         empty.at[state[:, :, None], action[:, None, :]].add(both),

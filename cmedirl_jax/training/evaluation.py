@@ -108,7 +108,7 @@ def summarise(rollouts: Rollouts) -> Evaluation:
 def evaluate(
     policy: Callable[[jax.Array], jax.Array], env: Env, params: Any, starts: int
 ) -> Evaluation:
-    """Evaluate `policy` on `starts` start states, evenly spread and the same at every call.
+    """Evaluate `policy` on `starts` fixed start states, the same at every call.
 
     Raises:
         ValueError: if `starts` is not positive, or the policy's actions are not `[starts, A]`.

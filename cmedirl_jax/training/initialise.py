@@ -109,7 +109,7 @@ class _Parts(NamedTuple):
     subset_size: int | None
 
 
-class _Keys(NamedTuple):
+class SeedKeys(NamedTuple):
     """Independent keys for all that is drawn once per seed."""
 
     agent: jax.Array
@@ -121,16 +121,16 @@ class _Keys(NamedTuple):
     sampler: jax.Array
 
 
-def _split(key: jax.Array) -> tuple[_Keys, jax.Array]:
+def split(key: jax.Array) -> tuple[SeedKeys, jax.Array]:
     """The keys of the beginning, and the key that every step's number is folded into."""
     # `fold_in(key, i)` equals the i-th key of a split of `key`: the steps need a key of their own.
     setup_key, steps_key = jax.random.split(key)
-    return _Keys(*jax.random.split(setup_key, len(_Keys._fields))), steps_key
+    return SeedKeys(*jax.random.split(setup_key, len(SeedKeys._fields))), steps_key
 
 
 def _draw_networks(parts: _Parts, key: jax.Array) -> tuple[Params, Params]:
     # A clone: `init` splits the same key.
-    state = parts.algorithm.agent.init(_split(jax.random.clone(key))[0].agent)
+    state = parts.algorithm.agent.init(split(jax.random.clone(key))[0].agent)
     return state.actor, state.critic
 
 
@@ -143,7 +143,7 @@ def _hot_start(
 ) -> tuple[Params, Params]:
     if not parts.method.hot_start:
         return networks
-    keys, _ = _split(jax.random.clone(key))
+    keys, _ = split(jax.random.clone(key))
     data, subset = _demonstrations(parts, keys, data, n_demonstrations)
     return hot_start.fit(
         keys.hot_start,
@@ -156,7 +156,7 @@ def _hot_start(
 
 
 def _demonstrations(
-    parts: _Parts, keys: _Keys, data: HotStartData | None, n_demonstrations: Numeric
+    parts: _Parts, keys: SeedKeys, data: HotStartData | None, n_demonstrations: Numeric
 ) -> tuple[HotStartData, DemonstrationSubset]:
     """The pool, and the seed's own demonstrations of it.
 
@@ -178,7 +178,7 @@ def _init(
     networks: tuple[Params, Params] | None = None,
 ) -> TrainingState:
     algorithm = parts.algorithm
-    keys, steps_key = _split(key)
+    keys, steps_key = split(key)
     if networks is None:
         drawn = _draw_networks(parts, key)
         networks = _hot_start(parts, key, data, n_demonstrations, drawn)
@@ -215,7 +215,7 @@ def _init(
 
 
 def _fit_table(
-    parts: _Parts, keys: _Keys, data: HotStartData, subset: DemonstrationSubset
+    parts: _Parts, keys: SeedKeys, data: HotStartData, subset: DemonstrationSubset
 ) -> RewardState:
     """The reward that dynamic programming learns from the demonstrations."""
     assert parts.method.tabular is not None

@@ -20,7 +20,7 @@ from cmedirl_jax.training import updates
 from cmedirl_jax.training.compose import Algorithm
 from cmedirl_jax.training.initialise import TrainingState
 from cmedirl_jax.training.schedules import Plan
-from cmedirl_jax.training.updates import UpdateDraws, UpdateParts
+from cmedirl_jax.training.updates import Added, UpdateDraws, UpdateParts
 from cmedirl_jax.types import Numeric, Transition
 
 
@@ -35,6 +35,8 @@ class Log(NamedTuple):
         learned: actor and critic were updated at this step.
         critic_loss: of that update, else 0.
         q_mean: of that update, else 0.
+        added: what r_D adds to r_e over that update's minibatch, or over this step's transition
+            where r* is stored, else zeros; None for methods without r_D.
         reward_learned: the reward was updated at this step.
         reward: diagnostics of that update, else zeros; None for methods that learn no reward.
     """
@@ -46,6 +48,7 @@ class Log(NamedTuple):
     learned: jax.Array
     critic_loss: jax.Array
     q_mean: jax.Array
+    added: Added | None
     reward_learned: jax.Array
     reward: RewardInfo | None
 
@@ -141,11 +144,13 @@ def learn(
     reward, sampler, reward_info = _learn_reward(
         parts, state, behaviour, ended, replay_state, draws, plan, pool
     )
+    stored = None
     if parts.updates.stores_shaped:
-        replay_state = _store_shaped(parts, state, reward, transition, replay_state, plan)
+        replay_state, stored = _store_shaped(parts, state, reward, transition, replay_state, plan)
 
     # Learn the agent.
     agent, losses = _learn_agent(parts, state.agent, reward, replay_state, draws, plan, pool)
+    losses = losses._replace(added=losses.added or stored)
     done = ended
     if max_episodes is not None:
         running = state.episode < max_episodes
@@ -202,11 +207,20 @@ def _store_shaped(
     transition: Transition,
     replay_state: ReplayState,
     plan: Plan,
-) -> ReplayState:
+) -> tuple[ReplayState, Added]:
     """Write r* over the r_e that was just stored; Algorithm 2 learns the reward first."""
     discount = state.agent.hparams.discount
     shaped = updates.shape(parts.updates, reward, transition, discount, plan.reward_weight)
-    return parts.algorithm.replay.add(ReplayState(replay_state.storage, plan.step), shaped)
+    replay_state = parts.algorithm.replay.add(ReplayState(replay_state.storage, plan.step), shaped)
+    return replay_state, updates.added(parts.updates, transition, shaped)
+
+
+class _Losses(NamedTuple):
+    """Of an update of the agent: fields of `Log`."""
+
+    critic_loss: jax.Array
+    q_mean: jax.Array
+    added: Added | None
 
 
 def _learn_agent(
@@ -217,17 +231,19 @@ def _learn_agent(
     draws: StepDraws,
     plan: Plan,
     pool: Transition | None,
-) -> tuple[DDPGState, tuple[jax.Array, jax.Array]]:
-    """Learn actor and critic where the plan says so; also `(critic_loss, q_mean)`, else zeros."""
+) -> tuple[DDPGState, _Losses]:
+    """Learn actor and critic where the plan says so; also the update's losses, else zeros."""
 
-    def update(agent: DDPGState) -> tuple[DDPGState, tuple[jax.Array, jax.Array]]:
-        agent, info = updates.update_agent(
+    def update(agent: DDPGState) -> tuple[DDPGState, _Losses]:
+        agent, info, added = updates.update_agent(
             parts.updates, agent, reward, pool, replay_state, draws.updates, plan
         )
-        return agent, (info.critic_loss, info.q_mean)
+        return agent, _Losses(info.critic_loss, info.q_mean, added)
 
-    none = modes.vary(jnp.zeros((), jnp.float32), agent, reward, replay_state, pool)
-    return jax.lax.cond(plan.learn, update, lambda agent: (agent, (none, none)), agent)
+    zero = modes.vary(jnp.zeros((), jnp.float32), agent, reward, replay_state, pool)
+    here = reward is not None and not parts.updates.stores_shaped
+    none = _Losses(zero, zero, Added(zero, zero) if here else None)
+    return jax.lax.cond(plan.learn, update, lambda agent: (agent, none), agent)
 
 
 def _keep_parameters(
@@ -248,18 +264,18 @@ def _log(
     answer: Step,
     done: jax.Array,
     plan: Plan,
-    losses: tuple[jax.Array, jax.Array],
+    losses: _Losses,
     reward: RewardInfo | None,
 ) -> Log:
-    critic_loss, q_mean = losses
     return Log(
         done=done,
         terminated=answer.terminated,
         episode_return=state.episode_return + answer.reward,
         episode_length=state.episode_length + 1,
         learned=plan.learn,
-        critic_loss=critic_loss,
-        q_mean=q_mean,
+        critic_loss=losses.critic_loss,
+        q_mean=losses.q_mean,
+        added=losses.added,
         reward_learned=plan.learn_reward,
         reward=reward,
     )

@@ -65,6 +65,18 @@ def make_parts(algorithm: Algorithm, method: Method, settings: Settings) -> Upda
     )
 
 
+class Added(NamedTuple):
+    """What r_D adds to the reward r_e over a minibatch, or over one transition.
+
+    Attributes:
+        mean: `[]`.
+        mean_square: `[]`.
+    """
+
+    mean: jax.Array
+    mean_square: jax.Array
+
+
 class UpdateDraws(NamedTuple):
     """The randomness of a step's minibatches; what a method does not use is empty.
 
@@ -155,6 +167,14 @@ def shape(
     return batch._replace(reward=shaping.additive(r_e, r_d, weight))
 
 
+def added(parts: UpdateParts, batch: Transition, shaped: Transition) -> Added:
+    """What `shape` added to a batch; all of r* for a method that learns from r_D alone."""
+    difference = shaped.reward
+    if parts.algorithm.shaping != "alone":
+        difference = shaped.reward - batch.reward
+    return Added(jnp.mean(difference), jnp.mean(jnp.square(difference)))
+
+
 def update_reward(
     parts: UpdateParts,
     reward_state: RewardState,
@@ -189,8 +209,8 @@ def update_agent(
     replay_state: ReplayState,
     draws: UpdateDraws,
     plan: Plan,
-) -> tuple[DDPGState, DDPGInfo]:
-    """One update of actor and critic on r*.
+) -> tuple[DDPGState, DDPGInfo, Added | None]:
+    """One update of actor and critic on r*; also what r_D added, where that is not stored.
 
     Args:
         parts: the method's.
@@ -203,15 +223,17 @@ def update_agent(
     """
     agent, hparams = parts.algorithm.agent, agent_state.hparams
     # The minibatch, with r* in place of r_e.
-    batch = parts.algorithm.replay.take(replay_state, draws.batch)
-    if not parts.stores_shaped:
-        batch = shape(parts, reward_state, batch, hparams.discount, plan.reward_weight)
+    batch, by_reward = parts.algorithm.replay.take(replay_state, draws.batch), None
+    if reward_state is not None and not parts.stores_shaped:
+        shaped = shape(parts, reward_state, batch, hparams.discount, plan.reward_weight)
+        batch, by_reward = shaped, added(parts, batch, shaped)
     update_actor = plan.update_actor if parts.freezes_actor else True
     update_targets = True if parts.always_moves_targets else plan.update_targets
     if parts.cloning == "none":
-        return agent.update(
+        agent_state, info = agent.update(
             agent_state, batch, update_actor=update_actor, update_targets=update_targets
         )
+        return agent_state, info, by_reward
     # The cloning term fades by its weight; the state keeps the weight that it began with.
     assert pool is not None
     faded = hparams.replace(behaviour_cloning=hparams.behaviour_cloning * plan.cloning_weight)
@@ -223,4 +245,4 @@ def update_agent(
         update_targets=update_targets,
         clone=True if parts.cloning == "constant" else plan.cloning_weight > 0,
     )
-    return agent_state.replace(hparams=hparams), info
+    return agent_state.replace(hparams=hparams), info, by_reward

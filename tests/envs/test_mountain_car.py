@@ -173,9 +173,9 @@ def test_reset_rests_somewhere_in_the_start_interval():
     assert not states.time.any()
 
 
-def test_starts_are_evenly_spaced_and_at_rest():
+def test_starts_are_the_midpoints_of_equal_parts_and_at_rest():
     states, observations = ENV.starts(5, PARAMS)
-    np.testing.assert_allclose(states.position, [-0.6, -0.55, -0.5, -0.45, -0.4], rtol=1e-6)
+    np.testing.assert_allclose(states.position, [-0.58, -0.54, -0.5, -0.46, -0.42], rtol=1e-6)
     np.testing.assert_array_equal(observations, np.stack([states.position, np.zeros(5)], axis=-1))
     assert not states.time.any()
 

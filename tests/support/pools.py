@@ -21,7 +21,7 @@ def controller(observation, push=0.3):
 
 @functools.cache
 def scripted(episodes=12, push=0.3):
-    """`episodes` episodes of `controller`, from evenly spread starts."""
+    """`episodes` episodes of `controller`, from the fixed starts."""
     rows = []
     advance = jax.jit(ENV.step)
     for index in range(episodes):

@@ -67,7 +67,7 @@ def test_summary_is_the_statistics_of_the_episodes():
     np.testing.assert_allclose(summary, expected, rtol=1e-6)
 
 
-def test_evaluate_summarises_rollouts_from_evenly_spread_starts(env, params):
+def test_evaluate_summarises_rollouts_from_the_fixed_starts(env, params):
     actual = evaluation.evaluate(bang_bang, env, params, 5)
     expected = evaluation.summarise(
         evaluation.rollout(bang_bang, env, params, env.starts(5, params))

@@ -70,7 +70,8 @@ def train(
     Args:
         programs: of the cell's method.
         key: the cell's randomness.
-        data: the demonstrations; None for a method without.
+        data: the demonstrations, with `episodes` `[learners, E]`: those that each learner of the
+            study draws from; None for a method without.
         n_demos: how many of them each seed draws.
         seeds_count: how many seeds.
         first_seed: the number of the first of them in the study.

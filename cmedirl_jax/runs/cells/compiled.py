@@ -18,6 +18,7 @@ from cmedirl_jax.runs.cluster.base import ALONE
 from cmedirl_jax.training import Log, TrainingState, seeds
 from cmedirl_jax.training.methods import METHODS, Method
 from cmedirl_jax.training.settings import Settings
+from cmedirl_jax.types import DemonstrationSubset
 
 
 class CompiledMethod(NamedTuple):
@@ -25,9 +26,11 @@ class CompiledMethod(NamedTuple):
 
     Attributes:
         draw_networks: `(keys [slots], groups) -> networks` `[slots, ...]`.
-        hot_start: `(keys, networks, groups, data, n_demonstrations) -> networks`; None for a method
-            without. It keeps its latest answer, which the next method asks for again.
-        init: `(keys, networks, groups, data, n_demonstrations) -> TrainingState` `[slots, ...]`.
+        hot_start: `(keys, networks, episodes, groups, data, n_demonstrations) -> networks`; None
+            for a method without. `episodes` `[slots, E]` are those of `data` that each seed draws
+            its own from. It keeps its latest answer, which the next method asks for again.
+        init: `(keys, networks, episodes, groups, data, n_demonstrations) -> TrainingState`
+            `[slots, ...]`.
         run: `(state, groups, data, steps, max_episodes) -> (TrainingState, Log)`; the state is
             donated. Only the first `groups` groups of slots on each device are stepped.
         permute: `(state, move [slots]) -> TrainingState`: slot i takes the seed of slot move[i].
@@ -73,13 +76,20 @@ def compile_hot_start(
     """Jit the hot start, which all methods that have one share; see `CompiledMethod.hot_start`."""
     trainer = training.make(env, METHODS["bc"], settings, capacity=1, subset_size=subset_size)
 
-    def of_seed(drawn: tuple[jax.Array, Any], data: HotStartData, n_demos: int):
-        key, networks = drawn
-        return drawn, trainer.hot_start(key, data, n_demos, networks)
+    def of_seed(seed: tuple[jax.Array, Any, Any], data: HotStartData, n_demos: int):
+        key, networks, episodes = seed
+        return seed, trainer.hot_start(key, data._replace(episodes=episodes), n_demos, networks)
 
-    def fit(keys: jax.Array, networks: Any, groups: int, data: HotStartData, n_demos: int) -> Any:
+    def fit(
+        keys: jax.Array,
+        networks: Any,
+        episodes: DemonstrationSubset,
+        groups: int,
+        data: HotStartData,
+        n_demos: int,
+    ) -> Any:
         spread = seeds.map_devices(seeds.step_groups(of_seed, group), devices)
-        return spread((keys, networks), groups, data, n_demos)[1]
+        return spread((keys, networks, episodes), groups, data, n_demos)[1]
 
     return _Latest(jax.jit(fit, out_shardings=seeds.sharding(devices)))
 
@@ -94,12 +104,18 @@ class _Latest:
         self._answer: Any = None
 
     def __call__(
-        self, keys: jax.Array, networks: Any, groups: int, data: HotStartData, n_demos: int
+        self,
+        keys: jax.Array,
+        networks: Any,
+        episodes: DemonstrationSubset,
+        groups: int,
+        data: HotStartData,
+        n_demos: int,
     ) -> Any:
-        # The keys decide the networks too.
+        # The keys decide the networks too, and with the data the episodes.
         question = (np.asarray(jax.random.key_data(keys)).tobytes(), groups, n_demos)
         if question != self._question or data is not self._data:
-            self._answer = self._fit(keys, networks, groups, data, n_demos)
+            self._answer = self._fit(keys, networks, episodes, groups, data, n_demos)
             self._question, self._data = question, data
         return self._answer
 
@@ -125,13 +141,19 @@ def compile_method(
         return seeds.map_devices(seeds.step_groups(function, group), devices)
 
     def start(
-        keys: jax.Array, networks: Any, groups: int, data: HotStartData | None, n_demos: int
+        keys: jax.Array,
+        networks: Any,
+        episodes: DemonstrationSubset | None,
+        groups: int,
+        data: HotStartData | None,
+        n_demos: int,
     ) -> TrainingState:
-        def of_seed(drawn: tuple[jax.Array, Any], *shared: Any):
-            key, networks = drawn
-            return drawn, trainer.init(key, *shared, networks)
+        def of_seed(seed: tuple[jax.Array, Any, Any], data: HotStartData | None, n_demos: int):
+            key, networks, episodes = seed
+            data = None if data is None else data._replace(episodes=episodes)
+            return seed, trainer.init(key, data, n_demos, networks)
 
-        return spread(of_seed)((keys, networks), groups, data, n_demos)[1]
+        return spread(of_seed)((keys, networks, episodes), groups, data, n_demos)[1]
 
     def permute(state: TrainingState, move: np.ndarray) -> TrainingState:
         return jax.tree.map(lambda leaf: leaf[move], state)
@@ -166,17 +188,27 @@ def begin(
     """
     groups = slots.groups(np.ones(slots.seeds, bool))
     keys = seeds.keys(key, first_seed + programs.slots)[first_seed:][slots.seed]
+    episodes = _episodes(data, first_seed + slots.seed)
     networks = programs.draw_networks(keys, groups)
     if programs.hot_start is not None:
-        networks = programs.hot_start(keys, networks, groups, data, n_demos)
-    return programs.init(keys, networks, groups, data, n_demos)
+        networks = programs.hot_start(keys, networks, episodes, groups, data, n_demos)
+    return programs.init(keys, networks, episodes, groups, data, n_demos)
+
+
+def _episodes(data: HotStartData | None, learners: np.ndarray) -> DemonstrationSubset | None:
+    """The episodes that each of these learners draws from; the last one's beyond the study's."""
+    if data is None:
+        return None
+    last = data.episodes.start.shape[0] - 1
+    return jax.tree.map(lambda leaf: leaf[np.minimum(learners, last)], data.episodes)
 
 
 def abstract(programs: CompiledMethod, data: HotStartData | None, n_demos: int) -> TrainingState:
     """The shapes and dtypes of what `begin` makes."""
 
     def of_keys(keys: jax.Array) -> TrainingState:
-        return programs.init(keys, programs.draw_networks(keys, 1), 1, data, n_demos)
+        episodes = _episodes(data, np.arange(programs.slots))
+        return programs.init(keys, programs.draw_networks(keys, 1), episodes, 1, data, n_demos)
 
     return jax.eval_shape(of_keys, seeds.keys(jax.random.key(0), programs.slots))
 

@@ -12,7 +12,7 @@ from cmedirl_jax.envs import Env
 from cmedirl_jax.runs.cells.evaluator import Evaluator
 
 STARTS = 3
-"""Start states per policy: both ends and the middle of the start interval."""
+"""Start states per policy."""
 
 
 class Replay(NamedTuple):

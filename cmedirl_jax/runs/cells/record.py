@@ -8,6 +8,7 @@ import numpy as np
 
 from cmedirl_jax.training import Log
 from cmedirl_jax.training.evaluation import Evaluation
+from cmedirl_jax.training.updates import Added
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +29,9 @@ class Means(NamedTuple):
     Attributes:
         q_mean: Q(s, a) over the agent's minibatches.
         critic_loss: mean squared temporal-difference error.
+        r_d_mean: what r_D adds to r_e over the agent's minibatches, or where r* is stored over the
+            new transitions; all of r* for a method that learns from r_D alone.
+        r_d_mean_square: likewise of its square.
         demonstration_reward: r_D over the reward learner's demonstrations.
         background_reward: r_D over its background.
         effective_sample_size: of its samples' weights.
@@ -35,13 +39,15 @@ class Means(NamedTuple):
 
     q_mean: np.ndarray
     critic_loss: np.ndarray
+    r_d_mean: np.ndarray
+    r_d_mean_square: np.ndarray
     demonstration_reward: np.ndarray
     background_reward: np.ndarray
     effective_sample_size: np.ndarray
 
 
-OF_AGENT = Means._fields[:2]
-OF_REWARD = Means._fields[2:]
+_OF_AGENT, _OF_ADDED, _OF_REWARD = Means._fields[:2], Means._fields[2:4], Means._fields[4:]
+"""Which are of the log's own fields, of its `added` and of its `reward`."""
 
 
 class EvaluationRows(NamedTuple):
@@ -137,12 +143,14 @@ class Record:
             finished = np.zeros(count, bool)
         # Sums over the updates until then.
         active = (steps[None, :] < end[:, None]) & self.running[:, None]
-        for source, names, updated in (
-            (log, OF_AGENT, active & log.learned),
-            (log.reward, OF_REWARD, active & log.reward_learned),
+        learned, reward_learned = active & log.learned, active & log.reward_learned
+        for source, names, fields, updated in (
+            (log, _OF_AGENT, _OF_AGENT, learned),
+            (log.added, _OF_ADDED, Added._fields, learned),
+            (log.reward, _OF_REWARD, _OF_REWARD, reward_learned),
         ):
-            for name in names if source is not None else ():
-                values = np.where(updated, getattr(source, name), 0.0)
+            for name, field in zip(names, fields, strict=True) if source is not None else ():
+                values = np.where(updated, getattr(source, field), 0.0)
                 getattr(self._sums, name)[:] += values.sum(axis=1)
                 getattr(self._updates, name)[:] += updated.sum(axis=1)
         self.env_step = np.where(self.running, end, self.env_step)

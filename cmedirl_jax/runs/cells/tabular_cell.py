@@ -18,10 +18,11 @@ from cmedirl_jax.runs.cluster.base import ALONE
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.tabular import discretise, imitation
 from cmedirl_jax.tabular.discretise import FiniteMDP
-from cmedirl_jax.training import seeds
+from cmedirl_jax.training import initialise, seeds
 from cmedirl_jax.training.evaluation import Evaluation
 from cmedirl_jax.training.methods import Method
 from cmedirl_jax.training.settings import Settings
+from cmedirl_jax.types import DemonstrationSubset
 
 
 class Fitted(NamedTuple):
@@ -42,7 +43,8 @@ class CompiledFit(NamedTuple):
     """The compiled functions of a method.
 
     Attributes:
-        fit: `(keys [slots], mdp, data, n_demonstrations) -> Fitted` `[slots, ...]`.
+        fit: `(keys [slots], episodes [slots, E], mdp, data, n_demonstrations) -> Fitted`
+            `[slots, ...]`.
         mdp: the environment on the grid.
         evaluator: of greedy policies, by tables of preferences `[seeds, S, A]`.
         soft_evaluator: of the soft policies, by tables of log-probabilities `[seeds, S, A]`.
@@ -70,11 +72,24 @@ def compile_method(
     assert kind is not None
     mdp = jax.jit(lambda: imitation.discretised(env, settings.tabular))()
 
-    def of_seed(key: jax.Array, mdp: FiniteMDP, data: HotStartData, n_demonstrations: int):
-        subset_key, fit_key = jax.random.split(key)
-        subset = demonstrations.subset(subset_key, data.episodes, n_demonstrations, subset_size)
+    def of_seed(
+        seed: tuple[jax.Array, DemonstrationSubset],
+        mdp: FiniteMDP,
+        data: HotStartData,
+        n_demonstrations: int,
+    ):
+        # The keys of the methods that act, so that a seed has the same demonstrations in each.
+        key, episodes = seed
+        keys, _ = initialise.split(key)
+        subset = demonstrations.subset(keys.subset, episodes, n_demonstrations, subset_size)
         fitted = imitation.fit(
-            fit_key, mdp, env.spec, data, subset, kind=kind, settings=settings.tabular
+            keys.reward,
+            mdp,
+            env.spec,
+            data._replace(episodes=episodes),
+            subset,
+            kind=kind,
+            settings=settings.tabular,
         )
         steps = jnp.sum(subset.length)
         return Fitted(fitted.reward, fitted.policy.log_probabilities, steps)
@@ -89,7 +104,7 @@ def compile_method(
         return discretise.look_up(mdp, table, observation)
 
     return CompiledFit(
-        fit=jax.jit(fit),
+        fit=jax.jit(lambda keys, episodes, *shared: fit((keys, episodes), *shared)),
         mdp=mdp,
         evaluator=evaluator_lib.make(env, greedy, 1, devices, gather),
         soft_evaluator=evaluator_lib.make(discretise.sampled(mdp, env), soft, 1, devices, gather),
@@ -113,7 +128,8 @@ def train(
     Args:
         programs: of the cell's method.
         key: the cell's randomness.
-        data: the demonstrations.
+        data: the demonstrations, with `episodes` `[learners, E]`: those that each learner of the
+            study draws from.
         n_demos: how many of them each seed draws.
         seeds_count: how many seeds.
         first_seed: the number of the first of them in the study.
@@ -125,13 +141,17 @@ def train(
     """
     # A seed takes seconds: the host looks for signals after one seed of each device.
     keys = seeds.keys(key, first_seed + seeds_count + programs.devices)[first_seed:]
+    learners = np.minimum(first_seed + np.arange(len(keys)), len(data.episodes.start) - 1)
+    episodes = jax.tree.map(lambda leaf: leaf[learners], data.episodes)
     parts: list[Fitted] = []
 
-    def fit(keys: jax.Array) -> Fitted:
-        return programs.fit(keys, programs.mdp, data, n_demos)
+    def fit(first: int) -> Fitted:
+        now = slice(first, first + programs.devices)
+        mine = jax.tree.map(lambda leaf: leaf[now], episodes)
+        return programs.fit(keys[now], mine, programs.mdp, data, n_demos)
 
     def abstract(record: dict[str, np.ndarray]) -> Fitted:
-        one = jax.eval_shape(fit, keys[: programs.devices])
+        one = jax.eval_shape(lambda: fit(0))
         return jax.tree.map(
             lambda leaf: jax.ShapeDtypeStruct((int(record["fitted"]), *leaf.shape[1:]), leaf.dtype),
             one,
@@ -147,7 +167,7 @@ def train(
         fitted = saved.step
         parts.append(saved.state)
     for first in range(fitted, seeds_count, programs.devices):
-        parts.append(programs.evaluator.gather(fit(keys[first : first + programs.devices])))
+        parts.append(programs.evaluator.gather(fit(first)))
         if checkpointer is not None:
             checkpointer.save_if_due(first + programs.devices, take)
     return _result(

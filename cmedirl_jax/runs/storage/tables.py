@@ -11,6 +11,8 @@ import polars.selectors as cs
 
 from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.gymnasium_replay import Replay
+from cmedirl_jax.runs.cells.pools import LearnersPool
+from cmedirl_jax.runs.cells.record import Means
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import cells, outputs
 from cmedirl_jax.runs.storage.cells import TABLES, CellKey, SavedCell
@@ -24,7 +26,7 @@ def rows(
     *,
     best_return: np.ndarray,
     replay: Replay,
-    expert_steps: int,
+    pool: LearnersPool | None,
 ) -> dict[str, pl.DataFrame]:
     """The rows of a finished cell in each table.
 
@@ -33,7 +35,7 @@ def rows(
         key: which cell it is.
         best_return: `[seeds]`, of each seed's best policy on fresh starts.
         replay: of the same policies.
-        expert_steps: environment steps that the experts were trained for.
+        pool: of the demonstrations; None for a method without.
     """
     labels = [
         pl.lit(key.study, pl.Int64).alias("study"),
@@ -47,7 +49,7 @@ def rows(
     return {
         "evaluations": labelled(_evaluations(result, key.first_seed)),
         "episodes": labelled(_episodes(result, key.first_seed)),
-        "seeds": labelled(_seeds(result, key.first_seed, best_return, replay, expert_steps)),
+        "seeds": labelled(_seeds(result, key, best_return, replay, pool)),
     }
 
 
@@ -60,11 +62,18 @@ def _evaluations(result: CellResult, first_seed: int) -> pl.DataFrame:
                 "env_step": rows.env_step.astype(np.int32),
                 "episode": rows.episode.astype(np.int32),
                 **{name: np.asarray(x) for name, x in rows.evaluation._asdict().items()},
-                **rows.means._asdict(),
+                **_means(rows.means),
             }
         )
         for rows in result.evaluations
     ).sort("seed", "env_step", maintain_order=True)
+
+
+def _means(means: Means) -> dict[str, np.ndarray]:
+    """The means as columns, with the deviation of r_D in place of its mean square."""
+    columns = means._asdict()
+    variance = columns.pop("r_d_mean_square") - means.r_d_mean**2
+    return {**columns, "r_d_std": np.sqrt(np.maximum(variance, 0.0))}
 
 
 def _episodes(result: CellResult, first_seed: int) -> pl.DataFrame:
@@ -84,28 +93,46 @@ def _episodes(result: CellResult, first_seed: int) -> pl.DataFrame:
 
 def _seeds(
     result: CellResult,
-    first_seed: int,
+    key: CellKey,
     best_return: np.ndarray,
     replay: Replay,
-    expert_steps: int,
+    pool: LearnersPool | None,
 ) -> pl.DataFrame:
     episodes, count = result.episodes, len(result.env_steps)
+    mine = slice(key.first_seed, key.first_seed + count)
+    unknown = np.full(count, np.nan)
+    expert = np.full(count, -1) if pool is None else pool.expert[mine]
     finished = np.zeros(count, np.int32)
     np.maximum.at(finished, episodes.seed, episodes.episode.astype(np.int32))
     difference = np.abs(replay.gymnasium_return - replay.jax_return).max(axis=1)
     return pl.DataFrame(
         {
-            "seed": np.arange(first_seed, first_seed + count, dtype=np.int32),
+            "seed": np.array(key.seed_range, np.int32),
+            # No expert, or no single one.
+            "expert_id": pl.Series(expert, dtype=pl.Int32).replace(-1, None),
+            "expert_return": unknown if pool is None else pool.expert_return[mine],
             "env_steps": result.env_steps.astype(np.int32),
             "episodes": finished,
             "demonstration_steps": result.demonstration_steps.astype(np.int32),
-            "expert_steps": np.full(count, expert_steps, np.int64),
+            "expert_steps": np.zeros(count, np.int64)
+            if pool is None
+            else pool.expert_steps[mine].astype(np.int64),
             "diverged": result.diverged,
+            "best_evaluation": _best_evaluation(result),
             "best_return": best_return.astype(np.float32),
             "gymnasium_return": replay.gymnasium_return.mean(axis=1),
             "gymnasium_difference": difference,
         }
     )
+
+
+def _best_evaluation(result: CellResult) -> np.ndarray:
+    """`[seeds]`, the highest of each seed's evaluations by steps: the paper's best policy."""
+    best = np.full(len(result.env_steps), -np.inf, np.float32)
+    for rows in result.evaluations:
+        if rows.protocol == "steps":
+            np.fmax.at(best, rows.seed, np.asarray(rows.evaluation.return_mean, np.float32))
+    return best
 
 
 def of_cells(
