@@ -1,5 +1,7 @@
 """The three configurations with a name: `tuned`, `paper` and `smoke`."""
 
+import dataclasses
+
 from cmedirl_jax.agents.ddpg import DDPGHParams
 from cmedirl_jax.agents.exploration import ExplorationSettings
 from cmedirl_jax.agents.hot_start import HotStartHParams
@@ -26,8 +28,11 @@ _PAPER_SETTINGS = Settings(
     reward_batches=RewardBatchSettings(recent=None),
     reward_schedule=RewardSchedule(period=1, stop=None, storage="store"),
     hot_start=HotStartHParams(critic="softmax"),
-    schedule=Schedule(replay_capacity=10_000, learning_starts=0, target_period=300, cloning="none"),
+    schedule=Schedule(recent=10_000, learning_starts=0, target_period=300, cloning="none"),
 )
+
+SWEEP = (1, 5, 10, 50, 100, 200)
+"""The numbers of demonstrations N_T of the full grid."""
 
 PRESETS: dict[str, StudyConfig] = {
     "tuned": StudyConfig(),
@@ -50,3 +55,12 @@ PRESETS: dict[str, StudyConfig] = {
         ),
     ),
 }
+
+
+def preset(name: str, grid: str = "main") -> StudyConfig:
+    """The configuration of a preset, on one of the two grids; `tuned` for an unknown name."""
+    config = PRESETS.get(name, PRESETS["tuned"])
+    if grid != "full":
+        return config
+    steps = 20_000 if config.preset == "tuned" else config.max_steps
+    return dataclasses.replace(config, grid="full", n_demos=SWEEP, max_steps=steps)

@@ -19,7 +19,7 @@ from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.console import compile_cache, ending, screen, signals, streams
 from cmedirl_jax.runs.errors import Interrupted, UserError
 from cmedirl_jax.runs.storage import plain
-from experiments.presets import PRESETS
+from experiments import presets
 
 _STOPPING = "Stopping after this chunk of steps; once more to stop at once\n"
 _CONTINUE = "start the same command again to go on"
@@ -94,11 +94,12 @@ def _end(exit_code: int, line: str) -> int:
 
 def parse(arguments: Sequence[str]) -> StudyConfig:
     """The configuration: the preset's, with whatever else the command line says."""
+    first = _read_first(arguments)
     return tyro.cli(
         StudyConfig,
         prog="python -m experiments.run_grid",
         description=__doc__,
-        default=PRESETS.get(_read_first(arguments).preset, PRESETS["tuned"]),
+        default=presets.preset(first.preset, first.grid),
         args=list(arguments),
     )
 
@@ -107,6 +108,7 @@ def _read_first(arguments: Sequence[str]) -> argparse.Namespace:
     # The preset decides every other default, which tyro needs; it reports a wrong one.
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--preset", default="tuned")
+    parser.add_argument("--grid", default="main")
     # A default number of demonstrations is no more than a file holds; a number given is meant.
     parser.add_argument("--n-demos", "--n_demos", nargs="*")
     return parser.parse_known_args(list(arguments))[0]

@@ -1,5 +1,6 @@
 """Rewards that learn nothing: controls for the effect of adding any reward at all."""
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -12,10 +13,24 @@ from cmedirl_jax.irl import base, regularisers, rewards
 from cmedirl_jax.irl.base import RewardLearner, RewardState
 from cmedirl_jax.irl.learner import IRLHParams
 from cmedirl_jax.optimizers import traced
+from cmedirl_jax.ranges import Positive
 from cmedirl_jax.types import EnvSpec, Network, Params
 
 PROBES = 1024
 """State-action pairs over which a random reward is standardised."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ControlSettings:
+    """Controls without information about the task.
+
+    Attributes:
+        random_share: Bound of a random reward, as a share of reward.bound. It sets the reward's
+            standard deviation; over the replay of `tuned` that is a learned reward's at the default
+            (columns r_d_std of evaluations.parquet).
+    """
+
+    random_share: Positive = 0.64
 
 
 class RandomParams(NamedTuple):
@@ -49,15 +64,21 @@ def constant(value: float) -> RewardLearner:
 
 
 def random(
-    spec: EnvSpec, hparams: IRLHParams | None = None, *, network: Network | None = None
+    spec: EnvSpec,
+    hparams: IRLHParams | None = None,
+    *,
+    share: float = 1.0,
+    network: Network | None = None,
 ) -> RewardLearner:
-    """Make r_D = bound tanh(f), f a random network with mean 0 and deviation 1 over uniform pairs.
+    """Make r_D = share bound tanh(f), f a random network.
 
-    It is bounded like a learned reward, and carries no information about the task.
+    f has mean 0 and deviation 1 over uniform pairs. The reward carries no information about the
+    task. With the bound of a learned reward it varies more; `share` makes them comparable.
 
     Args:
         spec: the environment's sizes and bounds, which have to be finite.
         hparams: only the bound is read.
+        share: of the bound, positive.
         network: default `rewards.mlp(spec)`. Its first parameters have to make it vary.
 
     Raises:
@@ -67,13 +88,14 @@ def random(
     checks.env_spec(spec)
     hparams = hparams or IRLHParams()
     ranges.check(hparams)
+    checks.positive(share=share)
     bounds = spec.observation_low, spec.observation_high
     if not np.isfinite(bounds).all():
         raise ValueError(f"{spec.id}: uniform pairs need finite bounds, got {bounds}")
     network = network or rewards.mlp(spec)
     return RewardLearner(
         init=functools.partial(_init_random, spec, network, hparams),
-        reward=functools.partial(_random_reward, spec, network),
+        reward=functools.partial(_random_reward, spec, network, share),
         update=base.learn_nothing,
     )
 
@@ -95,6 +117,7 @@ def _init_random(
 def _random_reward(
     spec: EnvSpec,
     network: Network,
+    share: float,
     state: RewardState,
     observation: jax.Array,
     action: jax.Array,
@@ -102,7 +125,7 @@ def _random_reward(
     checks.pairs(spec, observation, action)
     params, mean, deviation = state.params
     output = (network.apply(params, observation, action) - mean) / deviation
-    return regularisers.bounded(output, state.hparams.bound)
+    return regularisers.bounded(output, share * state.hparams.bound)
 
 
 def _uniform(key: jax.Array, low: np.ndarray, high: np.ndarray) -> jax.Array:

@@ -56,6 +56,8 @@ class StudyConfig:
     Attributes:
         preset: tuned: the setting that works; paper: the paper's letter; smoke: ends within a
             minute.
+        grid: main: one number of demonstrations; full: the paper's sweep over N_T, and under tuned
+            20,000 steps for each learner.
         methods: Which methods to train.
         n_demos: Demonstrated trajectories N_T per learner; several make Figures 4 and 5. By
             default also all that the file of --demos holds, where it holds fewer.
@@ -69,7 +71,7 @@ class StudyConfig:
         evaluate_every_episodes: Also evaluate each learner whenever it has lived this many more
             episodes (the paper: 100).
         evaluation_starts_episodes: Start states of the evaluations by episodes.
-        out: Folder of the results; default results/PRESET.
+        out: Folder of the results; default results/PRESET, or results/PRESET-full.
         expert: Who demonstrates: each learner has an expert of its own, or all share the best one
             that solved the task, the median one, or all of them alike.
         demos: A demonstrations file to learn from; no experts are trained, and their options are
@@ -93,6 +95,7 @@ class StudyConfig:
     """
 
     preset: Literal["tuned", "paper", "smoke"] = "tuned"
+    grid: Literal["main", "full"] = "main"
     methods: tuple[str, ...] = PAPER_METHODS
     n_demos: tuple[Size, ...] = (200,)
     seeds: Size = 100
@@ -132,7 +135,8 @@ class StudyConfig:
     @property
     def folder(self) -> Path:
         """Where the results go."""
-        out = self.out if self.out is not None else Path("results") / self.preset
+        name = self.preset if self.grid == "main" else f"{self.preset}-{self.grid}"
+        out = self.out if self.out is not None else Path("results") / name
         # Normalised: making a/../b would also make a.
         return Path(os.path.normpath(out))
 

@@ -149,9 +149,12 @@ def of_seeds(evaluations: pl.DataFrame, diverged: np.ndarray, threshold: float) 
     """
     by_seed = curves(evaluations)
     longest = max(curve.return_mean.size for curve in by_seed.values())
+    # A diverged seed misses one at least, also where all seeds of the cell diverged together.
     rows = [
         seed_statistics(
-            curve, threshold, missing=longest - curve.return_mean.size if diverged[seed] else 0
+            curve,
+            threshold,
+            missing=max(longest - curve.return_mean.size, 1) if diverged[seed] else 0,
         )
         for seed, curve in by_seed.items()
     ]

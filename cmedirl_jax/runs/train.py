@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.data.hot_start_data import HotStartData
 from cmedirl_jax.runs import numerics
 from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells import compiled as compiled_lib
@@ -29,6 +30,7 @@ from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage.cells import CellKey
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.runs.validation import Plan
+from cmedirl_jax.training import seeds
 from cmedirl_jax.training.methods import METHODS, Method
 from cmedirl_jax.training.settings import Settings
 
@@ -77,6 +79,7 @@ class Session(NamedTuple):
     cluster: Cluster
     compiled: Callable[[Method, Settings, int], CompiledMethod]
     compiled_fit: Callable[[Method], tabular_cell.CompiledFit]
+    place: Callable[[HotStartData], HotStartData]
 
     def checkpointer(self, name: str) -> Checkpointer:
         """Saves the training that is called `name`."""
@@ -123,6 +126,10 @@ def session_of(
                 gather=cluster.gather,
             )
         ),
+        # On every device once, rather than at each call.
+        lambda data: data._replace(
+            transition=jax.device_put(data.transition, seeds.replicated(devices))
+        ),
     )
 
 
@@ -149,6 +156,8 @@ def train_cells(session: Session, todo: Sequence[Cell]) -> None:
             with session.checkpointer(EXPERTS) as checkpointer:
                 pool = _train_experts(session, checkpointer, report)
             used = plan.of_learners(pool)
+        if used is not None:
+            used = used._replace(data=session.place(used.data))
         if pool is not None and stored is None and cluster.writer:
             stored_demonstrations.save(plan.folder, pool)
         if pool is not None and cluster.writer:
@@ -235,7 +244,7 @@ def _train(
 ) -> tuple[CellResult, Evaluator]:
     """Train a cell; gives its evaluator too."""
     plan, key, budget = session.plan, session.keys.learners, session.plan.budget
-    seeds = {"seeds_count": len(cell.block), "first_seed": cell.block.start}
+    block = {"seeds_count": len(cell.block), "first_seed": cell.block.start}
     if cell.method.tabular is not None and not cell.method.interacts:
         fit = session.compiled_fit(cell.method)
         assert pool is not None
@@ -244,7 +253,7 @@ def _train(
             key,
             pool.data,
             cell.n_demos,
-            **seeds,
+            **block,
             evaluation_starts=budget.evaluation_starts,
             checkpointer=checkpointer,
         )
@@ -255,7 +264,7 @@ def _train(
         key,
         pool.data if pool is not None and cell.n_demos else None,
         cell.n_demos,
-        **seeds,
+        **block,
         budget=budget if cell.method.interacts else dataclasses.replace(budget, max_steps=0),
         threshold=plan.env.spec.reward_threshold,
         report=_stepwise(report, len(cell.block)),

@@ -49,6 +49,8 @@ class TabularSettings:
         discount: Discount of the soft-optimal policy and of both visitations, per environment step.
         temperature: Temperature alpha of the soft-optimal policy, in units of the reward.
         reward: r(s, a), or r(s).
+        deviation: As r_D for an agent: its standard deviation over the states that demonstrations
+            visit, in units of the environment's reward.
         prior_precision: Precision of the Gaussian prior on theta, against the log-likelihood of one
             demonstration.
         steps: Steps of Adam.
@@ -65,6 +67,7 @@ class TabularSettings:
     discount: BelowOne = 0.99
     temperature: Positive = 1.0
     reward: rewards.Inputs = "state-action"
+    deviation: Positive = 0.036
     prior_precision: NotNegative = 1e-3
     steps: Size = 100
     centres: AtLeastTwo = 9

@@ -230,4 +230,10 @@ def _fit_table(
         kind=parts.method.tabular,
         settings=settings.tabular,
     )
-    return table_reward.state(fitted.reward[:-1], settings.reward)
+    visits = imitation.visitation(mdp, data, subset, discount=settings.tabular.discount).visitation
+    return table_reward.state(
+        fitted.reward[:-1],
+        jnp.sum(visits[:-1], axis=1),
+        settings.tabular.deviation,
+        settings.reward,
+    )

@@ -14,6 +14,7 @@ from cmedirl_jax.agents import exploration
 from cmedirl_jax.agents.ddpg import DDPGHParams
 from cmedirl_jax.agents.exploration import ExplorationSettings
 from cmedirl_jax.irl import GAILHParams, IRLHParams, RewardLearner
+from cmedirl_jax.irl.controls import ControlSettings
 from cmedirl_jax.irl.objectives import OBJECTIVES, ObjectiveName
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
 from cmedirl_jax.irl.rewards import NETWORKS, RewardNetworkSettings
@@ -34,6 +35,7 @@ class RewardSettings:
         reward_network: f(s, a), before any bound.
         reward_batches: which samples a learned reward learns from.
         tabular: the grid and the fit of a reward by dynamic programming.
+        controls: rewards without information.
     """
 
     reward: IRLHParams = IRLHParams()
@@ -41,6 +43,7 @@ class RewardSettings:
     reward_network: RewardNetworkSettings = RewardNetworkSettings()
     reward_batches: RewardBatchSettings = RewardBatchSettings()
     tabular: TabularSettings = TabularSettings()
+    controls: ControlSettings = ControlSettings()
 
 
 class RewardUse(NamedTuple):
@@ -198,7 +201,10 @@ REWARDS: Registry[RewardSource] = Registry(
         # Controls: a frozen random network, and the bound of "maxent" everywhere.
         "random": RewardSource(
             lambda spec, settings, network: irl.controls.random(
-                spec, settings.reward, network=network
+                spec,
+                settings.reward,
+                share=settings.controls.random_share,
+                network=network,
             ),
             check=_check_random,
         ),

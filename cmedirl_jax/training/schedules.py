@@ -48,6 +48,8 @@ class Schedule:
     Attributes:
         batch_size: Transitions per update.
         replay_capacity: Transitions the replay holds; None: every one of the run.
+        recent: Latest transitions that the agent's minibatches are drawn from; None: all that the
+            replay holds. A learned reward draws its background by reward_batches.recent.
         learning_starts: Environment steps before the first update.
         update_period: Environment steps between updates of actor and critic.
         target_period: Environment steps between target updates (the paper: 300, with agent.tau 1).
@@ -60,6 +62,7 @@ class Schedule:
 
     batch_size: Size = 32
     replay_capacity: Size | None = None
+    recent: Size | None = None
     learning_starts: Count = 200
     update_period: Size = 1
     target_period: Size = 1

@@ -161,6 +161,11 @@ def sharding(devices: Sequence[Any]) -> jax.sharding.NamedSharding:
     return jax.sharding.NamedSharding(mesh, jax.P("seeds"))
 
 
+def replicated(devices: Sequence[Any]) -> jax.sharding.NamedSharding:
+    """A copy on each of `devices`, as `map_devices` shares its other arguments."""
+    return jax.sharding.NamedSharding(sharding(devices).mesh, jax.P())
+
+
 def map_devices(function: Callable[..., State], devices: Sequence[Any]) -> Callable[..., State]:
     """Split the leading axis of the first argument over `devices`; share the other arguments.
 

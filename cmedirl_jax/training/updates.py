@@ -29,6 +29,7 @@ class UpdateParts(NamedTuple):
     Attributes:
         algorithm: the method's parts.
         batch_size: transitions per update of the agent.
+        recent: latest transitions that they are drawn from; None: all of the replay.
         iterations: K of Algorithm 1, iterations per update of the reward.
         cloning: how the behaviour-cloning term goes on after the hot start.
         stores_shaped: r* is stored in the replay in place of r_e.
@@ -38,6 +39,7 @@ class UpdateParts(NamedTuple):
 
     algorithm: Algorithm
     batch_size: int
+    recent: int | None
     iterations: int
     cloning: Cloning
     stores_shaped: bool
@@ -57,6 +59,7 @@ def make_parts(algorithm: Algorithm, method: Method, settings: Settings) -> Upda
     return UpdateParts(
         algorithm=algorithm,
         batch_size=schedule.batch_size,
+        recent=schedule.recent,
         iterations=reward_schedule.iterations,
         cloning=schedule.cloning if method.hot_start else "none",
         stores_shaped=algorithm.learner is not None and reward_schedule.storage == "store",
@@ -223,7 +226,7 @@ def update_agent(
     """
     agent, hparams = parts.algorithm.agent, agent_state.hparams
     # The minibatch, with r* in place of r_e.
-    batch, by_reward = parts.algorithm.replay.take(replay_state, draws.batch), None
+    batch, by_reward = parts.algorithm.replay.take(replay_state, draws.batch, parts.recent), None
     if reward_state is not None and not parts.stores_shaped:
         shaped = shape(parts, reward_state, batch, hparams.discount, plan.reward_weight)
         batch, by_reward = shaped, added(parts, batch, shaped)

@@ -27,7 +27,7 @@ CELLS_ASKED = ("methods", "n_demos", "seeds")
 """The options that say which cells there are. The same folder may be given others."""
 _LOCK = ".lock"
 _NOT_COMPARED = (
-    *("out", "devices", "distributed", "coordinator", "processes", "process_id"),
+    *("out", "grid", "devices", "distributed", "coordinator", "processes", "process_id"),
     *("checkpoint_every", "check_demos", *CELLS_ASKED),
 )
 
