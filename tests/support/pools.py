@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from cmedirl_jax import envs
 from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.runs.cells.pools import of_learners
 from cmedirl_jax.types import Transition
 
 ENV = envs.make("MountainCarContinuous-v0")
@@ -21,13 +22,12 @@ def controller(observation, push=0.3):
 
 @functools.cache
 def scripted(episodes=12, push=0.3):
-    """`episodes` episodes of `controller`, from the fixed starts."""
+    """`episodes` episodes of `controller`, at rest from -0.6 to -0.4."""
     rows = []
     advance = jax.jit(ENV.step)
-    for index in range(episodes):
-        states, observations = ENV.starts(episodes, ENV.default_params)
-        state = jax.tree.map(lambda leaf, index=index: leaf[index], states)
-        observation, done = observations[index], False
+    for index, position in enumerate(np.linspace(-0.6, -0.4, episodes, dtype=np.float32)):
+        observation, done = jnp.array([position, 0.0]), False
+        state = ENV.state_at(observation, ENV.default_params)
         while not done:
             action = controller(observation, push)
             state, step = advance(jax.random.key(0), state, action, ENV.default_params)
@@ -40,6 +40,11 @@ def scripted(episodes=12, push=0.3):
     columns = [np.stack(column) for column in zip(*rows, strict=True)]
     metadata = {"env": ENV.spec.id}
     return Demonstrations(Transition(*columns[:5]), columns[5], columns[6], metadata)
+
+
+def for_learners(pool, learners=8):
+    """A pool as cells take it: each learner may draw from all of it."""
+    return of_learners(pool, learners).data
 
 
 episode_lengths = st.lists(st.integers(1, 6), min_size=1, max_size=8)

@@ -62,14 +62,14 @@ def _evaluations(result: CellResult, first_seed: int) -> pl.DataFrame:
                 "env_step": rows.env_step.astype(np.int32),
                 "episode": rows.episode.astype(np.int32),
                 **{name: np.asarray(x) for name, x in rows.evaluation._asdict().items()},
-                **_means(rows.means),
+                **means(rows.means),
             }
         )
         for rows in result.evaluations
     ).sort("seed", "env_step", maintain_order=True)
 
 
-def _means(means: Means) -> dict[str, np.ndarray]:
+def means(means: Means) -> dict[str, np.ndarray]:
     """The means as columns, with the deviation of r_D in place of its mean square."""
     columns = means._asdict()
     variance = columns.pop("r_d_mean_square") - means.r_d_mean**2

@@ -89,7 +89,7 @@ def train(
     n_demos=0,
     first_seed=0,
 ):
-    pool = hot_start.data(pools.scripted()) if n_demos else None
+    pool = pools.for_learners(pools.scripted()) if n_demos else None
     chunks, reports, seed_keys = [], [], []
 
     def run(state, groups, data, steps, limit):
@@ -396,7 +396,9 @@ def test_a_diverged_seed_keeps_what_came_before_the_chunk_and_its_best_policy(pr
     before = [row for row in episode_rows(by_steps.result, 1) if row[2] <= 50]
     assert episode_rows(result, 1) == before
     highest = max(row.return_mean for row in evaluation_rows(result, seed=1))
-    assert mean_return(programs, result.best, STARTS)[1] == highest
+    # Evaluated again beside other seeds, it may round otherwise.
+    again = mean_return(programs, result.best, STARTS)[1]
+    np.testing.assert_allclose(again, highest, rtol=1e-6)
 
 
 def test_a_cell_ends_when_every_seed_has_diverged(programs):

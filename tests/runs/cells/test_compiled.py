@@ -8,9 +8,12 @@ from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.training import seeds
 from cmedirl_jax.training.methods import METHODS
+from cmedirl_jax.types import DemonstrationSubset
+from tests.support import pools
 from tests.support.trainers import ENV, SMALL, data
 
 SEEDS, KEY = 3, jax.random.key(3)
+POOL = pools.for_learners(pools.scripted())
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +24,7 @@ def compiled():
 def begin(compiled, method, n_demos=2, first_seed=0, pool=None):
     programs = compiled(METHODS[method], SMALL, SEEDS)
     slots = Slots(programs.slots, SEEDS, programs.group, programs.devices)
-    pool = data() if pool is None else pool
+    pool = POOL if pool is None else pool
     state = compiled_lib.begin(programs, slots, KEY, pool, n_demos, first_seed)
     return jax.tree.map(lambda leaf: np.asarray(leaf)[slots.of_seed], state.agent.actor)
 
@@ -38,7 +41,7 @@ def test_methods_share_one_hot_start(compiled, monkeypatch):
     # Whatever else it is asked, it answers anew.
     begin(compiled, "bc", n_demos=3)
     begin(compiled, "bc", n_demos=3, first_seed=1)
-    begin(compiled, "bc", n_demos=3, first_seed=1, pool=jax.tree.map(lambda leaf: leaf, data()))
+    begin(compiled, "bc", n_demos=3, first_seed=1, pool=jax.tree.map(lambda leaf: leaf, POOL))
     assert len(calls) == 4
 
 
@@ -46,7 +49,8 @@ def test_methods_share_one_hot_start(compiled, monkeypatch):
 def test_seeds_begin_as_the_trainer_lets_them(compiled, method):
     actor = begin(compiled, method, first_seed=1)
     trainer = training.make(ENV, METHODS[method], SMALL, capacity=50, subset_size=3)
-    alone = jax.jit(lambda key: trainer.init(key, data(), 2).agent.actor)
+    pool = data()
+    alone = jax.jit(lambda key: trainer.init(key, pool, 2).agent.actor)
     for seed, key in enumerate(seeds.keys(KEY, SEEDS + 1)[1:]):
         one = jax.tree.map(lambda leaf, seed=seed: leaf[seed], actor)
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-4), one, alone(key))
@@ -56,6 +60,17 @@ def test_seeds_begin_as_the_trainer_lets_them(compiled, method):
 def test_shapes_are_those_of_the_beginning(compiled, method):
     programs = compiled(METHODS[method], SMALL, SEEDS)
     slots = Slots(programs.slots, SEEDS, programs.group, programs.devices)
-    state = compiled_lib.begin(programs, slots, KEY, data(), 2)
-    shapes = compiled_lib.abstract(programs, data(), 2)
+    state = compiled_lib.begin(programs, slots, KEY, POOL, 2)
+    shapes = compiled_lib.abstract(programs, POOL, 2)
     chex.assert_trees_all_equal_shapes_and_dtypes(shapes, state)
+
+
+def test_each_learner_draws_from_the_episodes_of_its_row(compiled):
+    programs = compiled(METHODS["hs-ddpg"], SMALL, SEEDS)
+    slots = Slots(programs.slots, SEEDS, programs.group, programs.devices)
+    start, length = POOL.episodes
+    rows = np.arange(12).reshape(4, 3)
+    own = POOL._replace(episodes=DemonstrationSubset(*(leaf[0][rows] for leaf in (start, length))))
+    state = compiled_lib.begin(programs, slots, KEY, own, 3, first_seed=1)
+    drawn = np.asarray(state.subset.start)[slots.of_seed]
+    np.testing.assert_array_equal(np.sort(drawn), start[0][rows[1:]])

@@ -55,7 +55,8 @@ def episode(actor, position, params):
 
 def test_rollouts_from_the_fixed_starts_match_double_precision(evaluator, actors, nearby):
     params = nearby.default_params
-    positions = np.linspace(params.start_low, params.start_high, STARTS)
+    edges = np.linspace(params.start_low, params.start_high, STARTS + 1)
+    positions = (edges[:-1] + edges[1:]) / 2
     expected = [
         [episode(reference.float64(actor), position, params) for position in positions]
         for actor in (jax.tree.map(lambda leaf, i=i: leaf[i], actors) for i in range(SEEDS))

@@ -5,6 +5,7 @@ from cmedirl_jax.irl import RewardInfo
 from cmedirl_jax.runs.cells.record import Budget, Means, Record
 from cmedirl_jax.training import Log
 from cmedirl_jax.training.evaluation import Evaluation
+from cmedirl_jax.training.updates import Added
 
 SEEDS, STEPS = 2, 6
 BUDGET = Budget(max_steps=100, max_episodes=2, evaluate_every=STEPS, evaluation_starts=1)
@@ -27,6 +28,7 @@ def log(start, *, done=(), learned=(), reward_learned=()):
         learned=at(learned),
         critic_loss=2 * number,
         q_mean=number,
+        added=Added(3 * number, 4 * number),
         reward_learned=at(reward_learned),
         reward=RewardInfo(*(k * number for k in range(1, 7))),
     )
@@ -46,12 +48,14 @@ def test_means_are_over_the_updates_of_each_kind_since_the_last_evaluation():
         [
             [2, 102],
             [4, 204],
+            [6, 306],
+            [8, 408],
             *(k * np.array([reward, reward + 100]) for k in (1, 2, 6)),
         ],
     )
     np.testing.assert_array_equal([mean[0] for mean in by_episodes], [mean[1] for mean in first])
-    np.testing.assert_array_equal(np.stack(second[:2]), [[6, 106], [12, 212]])
-    assert np.isnan(second[2:]).all()
+    np.testing.assert_array_equal(np.stack(second[:4]), [[6, 106], [12, 212], [18, 318], [24, 424]])
+    assert np.isnan(second[4:]).all()
 
 
 def test_what_a_seed_does_past_its_last_episode_is_not_its_own():
@@ -65,13 +69,15 @@ def test_what_a_seed_does_past_its_last_episode_is_not_its_own():
     assert record.running.tolist() == [False, True]
 
 
-def test_a_method_that_learns_no_reward_has_none_of_its_means():
+def test_a_method_without_a_reward_has_none_of_its_means():
     record = Record(SEEDS, BUDGET)
-    chunk = log(0, learned=[1], reward_learned=[1])._replace(reward=None)
+    chunk = log(0, learned=[1], reward_learned=[1])._replace(reward=None, added=None)
     record.stepped(np.arange(STEPS), chunk)
     record.evaluated("steps", np.arange(SEEDS), FOUND)
     means = record.evaluations[0].means
     assert Means._fields[2:] == (
+        "r_d_mean",
+        "r_d_mean_square",
         "demonstration_reward",
         "background_reward",
         "effective_sample_size",

@@ -33,7 +33,7 @@ def programs(env):
 
 
 def train(programs, seeds_count, n_demos=2, checkpointer=None, first_seed=0):
-    data = hot_start.data(pools.scripted())
+    data = pools.for_learners(pools.scripted())
     return tabular_cell.train(
         programs,
         jax.random.key(3),

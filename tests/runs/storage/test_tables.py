@@ -5,18 +5,23 @@ from polars.testing import assert_frame_equal
 
 from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.gymnasium_replay import Replay
+from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.cells.record import EpisodeRows, EvaluationRows, Means
 from cmedirl_jax.runs.storage import tables
 from cmedirl_jax.runs.storage.cells import CellKey
 from cmedirl_jax.training.evaluation import Evaluation
 
 LABELS = {"study": pl.Int64, "expert": pl.String, "method": pl.String, "n_demos": pl.Int32}
+MEANS = [
+    *("q_mean", "critic_loss", "r_d_mean"),
+    *("demonstration_reward", "background_reward", "effective_sample_size", "r_d_std"),
+]
 SCHEMAS = {
     "evaluations": {
         "protocol": pl.String,
         **dict.fromkeys(("seed", "env_step", "episode"), pl.Int32),
         **dict.fromkeys(("return_mean", "return_std", "goal_fraction", "length_mean"), pl.Float32),
-        **dict.fromkeys(Means._fields, pl.Float64),
+        **dict.fromkeys(MEANS, pl.Float64),
     },
     "episodes": {
         **dict.fromkeys(("seed", "episode", "env_step"), pl.Int32),
@@ -25,10 +30,12 @@ SCHEMAS = {
         "terminated": pl.Boolean,
     },
     "seeds": {
-        **dict.fromkeys(("seed", "env_steps", "episodes", "demonstration_steps"), pl.Int32),
+        **dict.fromkeys(("seed", "expert_id"), pl.Int32),
+        "expert_return": pl.Float64,
+        **dict.fromkeys(("env_steps", "episodes", "demonstration_steps"), pl.Int32),
         "expert_steps": pl.Int64,
         "diverged": pl.Boolean,
-        "best_return": pl.Float32,
+        **dict.fromkeys(("best_evaluation", "best_return"), pl.Float32),
         **dict.fromkeys(("gymnasium_return", "gymnasium_difference"), pl.Float64),
     },
 }
@@ -49,7 +56,16 @@ def evaluation(protocol, env_step, *seeds):
     )
 
 
-def rows(episodes, first_seed=0):
+def experts(first_seed=0):
+    """A pool in which learners 0 and 1 from `first_seed` on have expert 1, and 2 has several."""
+    ids = np.r_[np.full(first_seed, 9), 1, 1, -1]
+    none = np.full(first_seed, np.nan)
+    steps = np.full(first_seed + 3, 4_000)
+    return LearnersPool(None, ids, np.r_[none, 94.0, 94.0, np.nan], steps, {})
+
+
+def rows(episodes, first_seed=0, experts=experts):
+    pool = experts(first_seed)
     result = CellResult(
         evaluations=[
             evaluation("steps", 0, 0, 1, 2),
@@ -71,7 +87,7 @@ def rows(episodes, first_seed=0):
         replay=Replay(
             np.array([[1.0, 2.0, 3.0]] * 3), np.array([[1, 2, 3], [1, 2.5, 2.75], [0, 2, 3]])
         ),
-        expert_steps=4_000,
+        pool=pool,
     )
 
 
@@ -128,11 +144,9 @@ def test_evaluations_are_in_order_of_seed_and_step(found):
 
 
 def test_statistics_of_no_update_are_missing_rather_than_nan(found):
-    for env_step, *statistics in (
-        found["evaluations"].select("env_step", *Means._fields).iter_rows()
-    ):
+    for env_step, *statistics in found["evaluations"].select("env_step", *MEANS).iter_rows():
         missing = [value is None for value in statistics]
-        assert missing == [env_step == 0] * len(Means._fields)
+        assert missing == [env_step == 0] * len(MEANS)
 
 
 def test_episodes_are_in_order_of_seed_and_number(found):
@@ -145,7 +159,22 @@ def test_episodes_are_in_order_of_seed_and_number(found):
 
 def test_seeds_have_their_budget_episodes_and_replay(found):
     assert found["seeds"].select(*SCHEMAS["seeds"]).rows() == [
-        (0, 250, 2, 70, 4_000, False, 93.0, 2.0, 0.0),
-        (1, 100, 0, 80, 4_000, True, 94.0, 2.0, 0.5),
-        (2, 250, 1, 90, 4_000, False, 95.0, 2.0, 1.0),
+        (0, 1, 94.0, 250, 2, 70, 4_000, False, 250.0, 93.0, 2.0, 0.0),
+        (1, 1, 94.0, 100, 0, 80, 4_000, True, 1.0, 94.0, 2.0, 0.5),
+        (2, None, None, 250, 1, 90, 4_000, False, 252.0, 95.0, 2.0, 1.0),
     ]
+
+
+def test_a_method_without_demonstrations_has_no_expert():
+    seeds = rows(EPISODES, experts=lambda first_seed: None)["seeds"]
+    assert (
+        seeds.select("expert_id", "expert_return", "expert_steps").rows() == [(None, None, 0)] * 3
+    )
+
+
+def test_the_deviation_of_a_reward_is_that_of_its_values():
+    values = np.random.default_rng(0).normal(0.1, 0.03, 50)
+    filled = Means(*(np.zeros(1) for _ in Means._fields))._replace(
+        r_d_mean=values.mean(keepdims=True), r_d_mean_square=(values**2).mean(keepdims=True)
+    )
+    assert tables.means(filled)["r_d_std"] == pytest.approx(values.std(), rel=1e-9)
