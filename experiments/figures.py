@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from cmedirl_jax.runs import drawing, statistics
+from cmedirl_jax.runs import drawing, intervals
 from cmedirl_jax.runs.console import streams
 from cmedirl_jax.runs.drawing import Axes, Figure
 from cmedirl_jax.training.methods import METHODS
@@ -178,17 +178,17 @@ def _band(
     points = rows.group_by(x, maintain_order=True).agg(pl.col(y)).sort(x)
     seeds = rows["seed"].n_unique()
     points = points.filter(pl.col(y).list.len() == seeds)
-    intervals = np.array([statistics.mean(values.to_numpy()) for values in points[y]])
-    if not len(intervals):
+    bands = np.array([intervals.mean(values.to_numpy()) for values in points[y]])
+    if not len(bands):
         return
     label = METHODS[method].label or method
-    if len(intervals) == 1:
+    if len(bands) == 1:
         # A method that never interacts has the same return at every step.
-        axes.axhline(intervals[0, 0], color=line["color"], linestyle="-.", label=label)
+        axes.axhline(bands[0, 0], color=line["color"], linestyle="-.", label=label)
         return
-    axes.plot(points[x], intervals[:, 0], **line, label=label)
+    axes.plot(points[x], bands[:, 0], **line, label=label)
     axes.fill_between(
-        points[x], intervals[:, 1], intervals[:, 2], color=line["color"], alpha=0.2, linewidth=0
+        points[x], bands[:, 1], bands[:, 2], color=line["color"], alpha=0.2, linewidth=0
     )
 
 

@@ -1,10 +1,9 @@
 """A cell's statistics over its seeds, from the run's tables.
 
-Every interval is a 95% one over seeds: Clopper-Pearson for shares, order statistics for medians, a
-percentile bootstrap for means. A seed that never reached the threshold counts as +infinity in a
-median; it is never dropped. A diverged seed takes its lowest return in every evaluation that it
-misses. The intervals hold for other seeds of the learners, not for other experts: all learners
-share one pool of demonstrations.
+The intervals are those of `runs.intervals`. A seed that never reached the threshold counts as
++infinity in a median; it is never dropped. A diverged seed takes its lowest return in every
+evaluation that it misses. Column `experts` says how many experts the seeds have: with one of their
+own each, intervals hold for other experts too; with 1 they speak of that expert alone.
 """
 
 from collections.abc import Callable
@@ -12,20 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
-import scipy.stats
+
+from cmedirl_jax.runs import intervals
+from cmedirl_jax.runs.intervals import Interval
 
 LABELS = ("study", "expert", "method", "n_demos")
 """The columns that say which cell a row belongs to."""
-CONFIDENCE = 0.95
-RESAMPLES = 2_000
-
-
-class Interval(NamedTuple):
-    """An estimate and its interval."""
-
-    estimate: float
-    low: float
-    high: float
 
 
 class SeedCurve(NamedTuple):
@@ -80,50 +71,6 @@ def seed_statistics(curve: SeedCurve, threshold: float, missing: int = 0) -> See
         final_return=final,
         return_after_convergence=float(returns[first:].mean()),
     )
-
-
-def share(successes: np.ndarray) -> Interval:
-    """A share of seeds `[seeds]` bool with its Clopper-Pearson interval."""
-    test = scipy.stats.binomtest(int(successes.sum()), successes.size)
-    interval = test.proportion_ci(CONFIDENCE, method="exact")
-    return Interval(float(successes.mean()), float(interval.low), float(interval.high))
-
-
-def median(values: np.ndarray) -> Interval:
-    """The lower median of `[seeds]` values, inf allowed, with its order-statistics interval."""
-    test = scipy.stats.quantile_test(values, q=0, p=0.5)
-    interval = test.confidence_interval(CONFIDENCE)
-    estimate = np.quantile(values, 0.5, method="lower")
-    # With few values scipy finds no order statistic for a bound and returns NaN: unbounded.
-    low = -np.inf if np.isnan(interval.low) else interval.low
-    high = np.inf if np.isnan(interval.high) else interval.high
-    return Interval(float(estimate), float(low), float(high))
-
-
-def mean(values: np.ndarray, statistic=np.mean) -> Interval:
-    """The mean (or another statistic) of `[seeds]` values with a percentile bootstrap interval."""
-    estimate = float(statistic(values))
-    if values.size < 2 or np.ptp(values) == 0:
-        return Interval(estimate, estimate, estimate)
-    result = scipy.stats.bootstrap(
-        (values,),
-        statistic,
-        n_resamples=RESAMPLES,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    )
-    interval = result.confidence_interval
-    return Interval(estimate, float(interval.low), float(interval.high))
-
-
-def interquartile_mean(values: np.ndarray) -> Interval:
-    """The mean of the middle half of `[seeds]` values (Agarwal et al. 2021)."""
-
-    def trimmed(sample: np.ndarray, axis: int = -1) -> Any:
-        return scipy.stats.trim_mean(sample, 0.25, axis=axis)
-
-    return mean(values, trimmed)
 
 
 def curves(evaluations: pl.DataFrame) -> dict[int, SeedCurve]:
@@ -183,14 +130,25 @@ def summarise(
     statistics = of_seeds(evaluations, diverged, threshold)
     lived = seeds.filter(~pl.col("diverged"))["episodes"].to_numpy()
     first = evaluations.row(0, named=True)
+    clusters = experts_of(seeds)
     return {
         **{name: first[name] for name in LABELS if name in first},
         "seeds": diverged.size,
+        "experts": None if clusters is None else np.unique(clusters).size,
         **_convergence(statistics, lived, max_episodes, interacts),
-        **_stability(statistics, interacts),
-        **_returns(statistics, evaluations, seeds, interacts),
+        **_stability(statistics, threshold, interacts, clusters),
+        **_returns(statistics, evaluations, interacts, clusters),
+        **_best(seeds, clusters),
+        **_rewards(evaluations),
         **_costs(seeds),
     }
+
+
+def experts_of(seeds: pl.DataFrame) -> np.ndarray | None:
+    """`[seeds]`, the expert of each; None where they have none, or not one each."""
+    if seeds["expert_id"].null_count():
+        return None
+    return seeds["expert_id"].to_numpy()
 
 
 def _convergence(
@@ -205,15 +163,15 @@ def _convergence(
     )
     restricted = np.where(converged, statistics.convergence_episode, float(max_episodes or 0))
     return {
-        **_interval("converged_fraction", lambda: share(converged), interacts),
+        **_interval("converged_fraction", lambda: intervals.share(converged), interacts),
         **_interval(
             "convergence_env_step_median",
-            lambda: _from_zero(median(statistics.convergence_env_step)),
+            lambda: _from_zero(intervals.median(statistics.convergence_env_step)),
             interacts,
         ),
         **_interval(
             "convergence_episode_median",
-            lambda: _from_zero(median(statistics.convergence_episode)),
+            lambda: _from_zero(intervals.median(statistics.convergence_episode)),
             comparable,
         ),
         "convergence_episode_mean": float(restricted.mean()) if comparable else None,
@@ -222,36 +180,80 @@ def _convergence(
     }
 
 
-def _stability(statistics: SeedStatistics, interacts: bool) -> dict[str, Any]:
-    dips = statistics.dip_fraction[~np.isnan(statistics.dip_fraction)]
+def _stability(
+    statistics: SeedStatistics, threshold: float, interacts: bool, clusters: np.ndarray | None
+) -> dict[str, Any]:
+    known = ~np.isnan(statistics.dip_fraction)
+    dips = statistics.dip_fraction[known]
+    of_known = None if clusters is None else clusters[known]
     sustained = statistics.sustained.astype(bool)
+    failed = statistics.final_return < threshold
     return {
-        **_interval("sustained_fraction", lambda: share(sustained), interacts),
-        **_interval("dip_fraction", lambda: mean(dips), dips.size > 0),
+        **_interval("sustained_fraction", lambda: intervals.share(sustained), interacts),
+        **_interval("failed_fraction", lambda: intervals.share(failed)),
+        **_interval("dip_fraction", lambda: intervals.rate(dips, clusters=of_known), dips.size > 0),
     }
 
 
 def _returns(
-    statistics: SeedStatistics, evaluations: pl.DataFrame, seeds: pl.DataFrame, interacts: bool
+    statistics: SeedStatistics,
+    evaluations: pl.DataFrame,
+    interacts: bool,
+    clusters: np.ndarray | None,
 ) -> dict[str, Any]:
     converged = np.isfinite(statistics.convergence_env_step)
     after = statistics.return_after_convergence[converged]
-    best = seeds["best_return"].to_numpy()
+    of_converged = None if clusters is None else clusters[converged]
     soft = evaluations.filter(pl.col("protocol") == "soft")["return_mean"].to_numpy()
-    middle = interquartile_mean(statistics.final_return)
+    middle = intervals.interquartile_mean(statistics.final_return, clusters=clusters)
     return {
-        **_interval("area", lambda: mean(statistics.area)),
+        **_interval("area", lambda: intervals.mean(statistics.area, clusters=clusters)),
         "final_return_mean": float(statistics.final_return.mean()),
         "final_return_std": _std(statistics.final_return),
         "soft_return_mean": float(soft.mean()) if soft.size else None,
         "soft_return_std": _std(soft),
-        "best_return_mean": float(best.mean()),
-        "best_return_std": _std(best),
-        **_interval("return_after_convergence", lambda: mean(after), interacts and after.size > 0),
+        **_interval(
+            "return_after_convergence",
+            lambda: intervals.mean(after, clusters=of_converged),
+            interacts and after.size > 0,
+        ),
         "iqm": middle.estimate,
         "iqm_low": middle.low,
         "iqm_high": middle.high,
     }
+
+
+def _best(seeds: pl.DataFrame, clusters: np.ndarray | None) -> dict[str, Any]:
+    """Columns on each seed's best policy, and on who demonstrated to it.
+
+    `best_evaluation` is the paper's "score of the best policy": the highest of many evaluations,
+    which luck raises. `best_return` scores the same policy on fresh starts; `best_optimism` is the
+    difference.
+    """
+    evaluation, fresh, expert = (
+        seeds[name].cast(pl.Float64).to_numpy()
+        for name in ("best_evaluation", "best_return", "expert_return")
+    )
+    return {
+        "best_evaluation_mean": float(evaluation.mean()),
+        "best_evaluation_std": _std(evaluation),
+        "best_return_mean": float(fresh.mean()),
+        "best_return_std": _std(fresh),
+        **_interval("best_optimism", lambda: intervals.mean(evaluation - fresh, clusters=clusters)),
+        "expert_return_mean": None if np.isnan(expert).any() else float(expert.mean()),
+        "expert_return_std": None if np.isnan(expert).any() else _std(expert),
+    }
+
+
+def _rewards(evaluations: pl.DataFrame) -> dict[str, Any]:
+    """Columns on what r_D adds to r_e over the replay, at the last evaluation of each seed."""
+    last = (
+        evaluations.filter(pl.col("r_d_std").is_not_null())
+        .sort("env_step")
+        .group_by("seed")
+        .agg(pl.col("r_d_mean", "r_d_std").last())
+    )
+    return {"r_d_mean": last["r_d_mean"].mean(), "r_d_std": last["r_d_std"].mean()}
 
 
 def _costs(seeds: pl.DataFrame) -> dict[str, Any]:
@@ -259,11 +261,17 @@ def _costs(seeds: pl.DataFrame) -> dict[str, Any]:
     return seeds.select(
         env_steps_learner=pl.col("env_steps").cast(pl.Int64).sum(),
         env_steps_demonstrations=pl.col("demonstration_steps").cast(pl.Int64).sum(),
-        env_steps_expert=pl.col("expert_steps").first(),
+        env_steps_expert=_expert_steps(),
         diverged=pl.col("diverged").sum(),
         gymnasium_return_mean=pl.col("gymnasium_return").mean(),
         gymnasium_difference_max=pl.col("gymnasium_difference").max(),
     ).row(0, named=True)
+
+
+def _expert_steps() -> pl.Expr:
+    """Steps of all experts: each learner's own are its own, shared ones count once."""
+    own = pl.col("expert").first() == "each"
+    return pl.when(own).then(pl.col("expert_steps").sum()).otherwise(pl.col("expert_steps").first())
 
 
 def _from_zero(interval: Interval) -> Interval:

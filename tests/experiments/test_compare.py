@@ -6,10 +6,9 @@ import shutil
 import numpy as np
 import polars as pl
 import pytest
-import scipy.stats
 from hypothesis import given, settings
 
-from cmedirl_jax.runs import validation
+from cmedirl_jax.runs import paired, validation
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage.cells import CellKey
@@ -39,13 +38,16 @@ def save(folder, method, n_demos, curves, diverged=()):
         )
         for seed, curve in enumerate(curves)
     )
-    seeds = pl.DataFrame(
-        {**labels, "seed": range(len(curves)), "diverged": np.isin(range(len(curves)), diverged)}
+    count = len(curves)
+    without = {} if n_demos else {"expert_id": [None] * count, "expert_return": [None] * count}
+    seeds = cells_of.seeds_table(
+        count, **labels, **without, diverged=np.isin(range(count), diverged)
     )
     rows = {"evaluations": evaluations, "seeds": seeds, "episodes": seeds}
     return cells_of.save(folder, key, rows)
 
 
+CELLS = ("method", "n_demos", "against", "against_n_demos")
 METHODS = ("ddpg", "hs-ddpg", "me-ddpg", "bc", "hs-me-ddpg")
 
 
@@ -79,7 +81,7 @@ def small(tmp_path_factory):
 
 
 def test_differences_are_of_pairs_of_seeds(folder):
-    table = compare.compare(folder, "ddpg")
+    table = compare.compare([folder], "ddpg")
     assert table["method"].unique(maintain_order=True).to_list() == ["hs-ddpg", "me-ddpg"]
     found = {row["measure"]: row for row in table.filter(pl.col("method") == "hs-ddpg").to_dicts()}
     steps = np.array([-100.0] * (SEEDS - 1) + [0.0])  # Never counts as the last step.
@@ -92,18 +94,16 @@ def test_differences_are_of_pairs_of_seeds(folder):
     ):
         assert found[name]["difference"] == pytest.approx(expected.mean())
         assert found[name]["difference_low"] <= expected.mean() <= found[name]["difference_high"]
-        signs = np.array(np.meshgrid(*[[-1, 1]] * SEEDS)).reshape(SEEDS, -1)
-        means = expected @ signs / SEEDS
-        p_value = min(2 * np.mean(means <= -abs(expected.mean()) + 1e-9), 1.0)
-        assert found[name]["p_value"] == pytest.approx(p_value)
+        assert found[name]["p_value"] == paired.p_value(expected, None)
     same = table.filter(pl.col("method") == "me-ddpg")
-    assert same["difference"].to_list() == [0.0] * 3
-    assert same["p_value"].to_list() == [1.0] * 3
+    assert same["difference"].to_list() == [0.0] * 4
+    assert same["p_value"].to_list() == [1.0] * 4
+    assert same["equivalence"].to_list() == ["equivalent"] * 4
 
 
 def test_a_diverged_seed_stands_at_its_lowest_return(folder):
     save(folder, "hs-me-ddpg", 5, [*[[0, 20, 95]] * (SEEDS - 1), [30, 95]], diverged=[5])
-    table = compare.compare(folder, "ddpg").filter(pl.col("method") == "hs-me-ddpg")
+    table = compare.compare([folder], "ddpg").filter(pl.col("method") == "hs-me-ddpg")
     difference = dict(table.select("measure", "difference").iter_rows())
     assert difference["final_return"] == pytest.approx((30 - 95) / SEEDS)
     assert difference["area"] == pytest.approx(((30 + 95 + 30) - 115) / 3 / SEEDS)
@@ -112,11 +112,16 @@ def test_a_diverged_seed_stands_at_its_lowest_return(folder):
 def test_cells_are_compared_at_their_own_number_of_demonstrations(folder):
     save(folder, "hs-ddpg", 7, [[0, 0, 95]] * SEEDS)
     save(folder, "me-ddpg", 7, [[0, 0, 95]] * SEEDS)
-    table = compare.compare(folder, "hs-ddpg").filter(pl.col("measure") == "convergence_env_step")
-    found = {
-        tuple(row[:2]): row[2] for row in table.select("method", "n_demos", "difference").rows()
+    table = compare.compare([folder], "hs-ddpg").filter(pl.col("measure") == "convergence_env_step")
+    found = {tuple(row[:4]): row[4] for row in table.select(*CELLS, "difference").rows()}
+    later = 100 * (SEEDS - 1) / SEEDS
+    assert found == {
+        ("me-ddpg", 5, "hs-ddpg", 5): pytest.approx(later),
+        ("me-ddpg", 7, "hs-ddpg", 7): 0.0,
+        # And each method with itself at the largest number.
+        ("hs-ddpg", 5, "hs-ddpg", 7): pytest.approx(-later),
+        ("me-ddpg", 5, "me-ddpg", 7): 0.0,
     }
-    assert found == {("me-ddpg", 5): pytest.approx(100 * (SEEDS - 1) / SEEDS), ("me-ddpg", 7): 0.0}
 
 
 @pytest.mark.parametrize(
@@ -128,28 +133,16 @@ def test_runs_without_paired_curves_are_refused(tmp_path, change, named):
     written = json.loads(path.read_text())
     written["config"] |= change
     path.write_text(json.dumps(written))
-    save(tmp_path, "ddpg", 0, [[0, 20, 95]])
+    save(tmp_path, "ddpg", 0, [[0, 20, 95]] * change.get("seeds", SEEDS))
     with pytest.raises(UserError, match=named):
-        compare.compare(tmp_path, "ddpg")
-
-
-def test_holms_p_values_are_stepwise():
-    found = compare.holm(np.array([0.01, 0.04, 0.03, 0.005]))
-    np.testing.assert_allclose(found, [0.03, 0.06, 0.06, 0.02])
-    assert compare.holm(np.array([0.9, 0.8])).tolist() == [1.0, 1.0]
-
-
-def test_holm_rejects_no_less_than_bonferroni_and_no_more_than_single_tests():
-    p_values = scipy.stats.uniform.rvs(size=20, random_state=0)
-    adjusted = compare.holm(p_values)
-    assert ((adjusted >= p_values) & (adjusted <= np.minimum(20 * p_values, 1.0))).all()
+        compare.compare([tmp_path], "ddpg")
 
 
 def test_the_command_prints_and_writes_the_table(folder, tmp_path, capsys):
     out = tmp_path / "new" / "differences.csv"
     assert compare.main([str(folder), "--against", "ddpg", "--out", str(out)]) == 0
-    assert "mean paired difference to ddpg" in capsys.readouterr().out
-    assert pl.read_csv(out).height == 2 * 3
+    assert "mean paired differences" in capsys.readouterr().out
+    assert pl.read_csv(out).height == 2 * 4
 
 
 @pytest.mark.parametrize(
@@ -178,7 +171,7 @@ CELL = "cells/ddpg-seeds-0-5"
 @given(damage=damages.damages())
 def test_a_damaged_file_of_a_run_is_a_users_error_or_harmless(small, name, damage):
     with damages.done_to(small / name, damage):
-        table, refusal = damages.attempt(UserError, compare.compare, small, "ddpg")
+        table, refusal = damages.attempt(UserError, compare.compare, [small], "ddpg")
     if refusal is not None:
         assert str(small) in refusal
         assert "\n" not in refusal
@@ -224,5 +217,39 @@ def test_a_run_of_other_files_is_refused_in_a_line(small, name, content, capsys)
 def test_cells_of_fewer_seeds_or_undefined_returns_are_refused(small, curves):
     path = save(small, "me-ddpg", 5, curves)
     with pytest.raises(UserError, match=f"me-ddpg has no finite returns of {SEEDS} seeds"):
-        compare.compare(small, "ddpg")
+        compare.compare([small], "ddpg")
     shutil.rmtree(path)
+
+
+def other_study(folder, seed=1, **changes):
+    """Another study seed of the same configuration, whose HS-DDPG is as slow as DDPG."""
+    write_config(folder, seed=seed, **changes)
+    for method, n_demos in (("ddpg", 0), ("hs-ddpg", 5)):
+        save(folder, method, n_demos, [[0, 20, 95]] * SEEDS)
+    return folder
+
+
+def test_studies_are_pooled_and_their_seeds_kept_apart(folder, tmp_path):
+    other = other_study(tmp_path / "other")
+    one, two, both = (
+        compare.compare(folders, "ddpg").filter(
+            pl.col("method") == "hs-ddpg", pl.col("measure") == "convergence_env_step"
+        )
+        for folders in ([folder], [other], [folder, other])
+    )
+    assert both["seeds"].item() == 2 * SEEDS
+    expected = (one["difference"].item() + two["difference"].item()) / 2
+    assert both["difference"].item() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"max_steps": 300}, "its max_steps is not that of"),
+        ({"seed": 0}, "holds seeds of ddpg that another folder holds too"),
+    ],
+)
+def test_runs_of_another_kind_or_of_the_same_seeds_are_not_pooled(folder, tmp_path, changes, named):
+    other = other_study(tmp_path / "other", **changes)
+    with pytest.raises(UserError, match=named):
+        compare.compare([folder, other], "ddpg")

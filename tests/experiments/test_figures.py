@@ -5,6 +5,7 @@ import pytest
 
 from cmedirl_jax.runs import statistics
 from experiments import figures
+from tests.support.cells import seeds_table
 
 THRESHOLD = 90.0
 STEPS = (0, 250, 500)
@@ -35,6 +36,8 @@ def run(cells, seeds=3):
                 "env_step": env_step,
                 "episode": env_step // 250,
                 "return_mean": value + seed if protocol == "steps" else 1e6,
+                "r_d_mean": None,
+                "r_d_std": None,
             }
             for (method, n_demos), curve in cells.items()
             for protocol in ("episodes", "steps")
@@ -56,11 +59,7 @@ def run(cells, seeds=3):
             for episode in range(1, seed + 3)
         ]
     )
-    numbers = dict.fromkeys(
-        ("env_steps", "episodes", "demonstration_steps", "expert_steps", "best_return"), 1
-    )
-    replay = {"gymnasium_return": 1.0, "gymnasium_difference": 0.0, "diverged": False}
-    per_seed = pl.DataFrame([{"seed": seed, **numbers, **replay} for seed in range(seeds)])
+    per_seed = seeds_table(seeds)
     summary = pl.DataFrame(
         [
             statistics.summarise(

@@ -3,12 +3,12 @@ import math
 import numpy as np
 import polars as pl
 import pytest
-import scipy.stats
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cmedirl_jax.runs import statistics
 from cmedirl_jax.runs.statistics import SeedCurve, SeedStatistics
+from tests.support.cells import seeds_table
 
 NEVER = math.inf
 UNDEFINED = math.nan
@@ -79,61 +79,11 @@ def test_seed_statistics_match_a_loop_over_the_evaluations(returns):
     np.testing.assert_allclose(statistics.seed_statistics(curve(returns), threshold), expected)
 
 
-@pytest.mark.parametrize("count", [1, 7, 100])
-def test_share_has_the_clopper_pearson_interval(count):
-    for successes in range(count + 1):
-        failures = count - successes
-        found = statistics.share(np.arange(count) < successes)
-        low = scipy.stats.beta.ppf(0.025, successes, failures + 1) if successes else 0.0
-        high = scipy.stats.beta.ppf(0.975, successes + 1, failures) if failures else 1.0
-        np.testing.assert_allclose(found, (successes / count, low, high), rtol=1e-6)
-
-
-@given(st.lists(st.integers(0, 20) | st.just(math.inf), min_size=1, max_size=40))
-def test_median_is_the_lower_one_between_symmetric_order_statistics(values):
-    ordered, count = sorted(values), len(values)
-    # The 1-based rank of the lower end: P(Binomial(count, 1/2) < rank) <= 2.5%.
-    cumulative = np.cumsum([math.comb(count, k) for k in range(count)]) / 2**count
-    rank = int((cumulative <= 0.025).sum())
-    low, high = (ordered[rank - 1], ordered[count - rank]) if rank else (-math.inf, math.inf)
-    found = statistics.median(np.array(values, float))
-    assert found == (ordered[(count - 1) // 2], low, high)
-
-
-def test_median_of_a_minority_that_never_arrived_is_finite_and_unbounded_above():
-    values = np.array([1, 2, 3, 4, 5, 6, NEVER, NEVER, NEVER])
-    assert statistics.median(values) == (5, 2, NEVER)
-
-
-def test_bootstrap_interval_covers_a_normal_mean_at_the_nominal_rate():
-    samples = np.random.default_rng(7).normal(3.0, 2.0, (300, 60))
-    intervals = [statistics.mean(sample) for sample in samples]
-    covered = np.mean([interval.low <= 3.0 <= interval.high for interval in intervals])
-    # Two standard errors of 300 trials about 94%, a percentile bootstrap's rate at this size.
-    assert 0.913 <= covered <= 0.967
-    np.testing.assert_allclose([interval.estimate for interval in intervals], samples.mean(axis=1))
-
-
-@pytest.mark.parametrize("values", [[2.5], [2.5, 2.5, 2.5]])
-def test_mean_of_equal_values_has_an_interval_of_no_width(values):
-    assert statistics.mean(np.array(values)) == (2.5, 2.5, 2.5)
-
-
-@given(st.lists(st.integers(-100, 100), min_size=1, max_size=15))
-@settings(max_examples=40)
-def test_interquartile_mean_drops_a_quarter_of_the_sorted_values_at_each_end(values):
-    cut = len(values) // 4
-    middle = sorted(values)[cut : len(values) - cut]
-    found = statistics.interquartile_mean(np.array(values, float))
-    assert found.estimate == pytest.approx(sum(middle) / len(middle))
-    assert min(values) <= found.low <= found.high <= max(values)
-
-
 def evaluations_of(*returns):
     """Rows of evaluations.parquet, in no order, for seeds with these curves."""
     rows = [
         {
-            "expert": "best",
+            "expert": "each",
             "method": "hs-ddpg",
             "n_demos": 10,
             "protocol": protocol,
@@ -141,6 +91,8 @@ def evaluations_of(*returns):
             "env_step": 250 * index,
             "episode": 2 * index,
             "return_mean": float(value) if protocol == "steps" else 1e6,
+            "r_d_mean": 0.01 * index if index else None,
+            "r_d_std": 0.02 * index if index else None,
         }
         for protocol in ("episodes", "steps")
         for seed, values in enumerate(returns)
@@ -149,36 +101,19 @@ def evaluations_of(*returns):
     return pl.DataFrame(rows).sample(fraction=1.0, shuffle=True, seed=0)
 
 
-def seeds_of(count, **columns):
-    """Rows of seeds.parquet."""
-    return pl.DataFrame(
-        {
-            "seed": range(count),
-            "env_steps": [500] * count,
-            "episodes": [7 + seed for seed in range(count)],
-            "demonstration_steps": [90] * count,
-            "expert_steps": [4_000] * count,
-            "diverged": [False] * count,
-            "best_return": [90.0 + 2.0 * seed for seed in range(count)],
-            "gymnasium_return": [91.0 + seed for seed in range(count)],
-            "gymnasium_difference": [0.001 * seed for seed in range(count)],
-            **columns,
-        }
-    )
-
-
 def test_summary_of_a_cell_by_hand():
     row = statistics.summarise(
         evaluations_of([0, 92, 80], [95, 95, 95], [0, 0, 94]),
-        seeds_of(3),
+        seeds_table(3),
         90.0,
         max_episodes=None,
     )
     expected = {
-        "expert": "best",
+        "expert": "each",
         "method": "hs-ddpg",
         "n_demos": 10,
         "seeds": 3,
+        "experts": 3,
         "converged_fraction": 1.0,
         "convergence_env_step_median": 250.0,
         "convergence_episode_median": 2.0,
@@ -190,13 +125,21 @@ def test_summary_of_a_cell_by_hand():
         "area": (172 + 285 + 94) / 9,
         "final_return_mean": 269 / 3,
         "final_return_std": np.std([80, 95, 94], ddof=1),
+        "failed_fraction": 1 / 3,
+        "best_evaluation_mean": 93.0,
+        "best_evaluation_std": 2.0,
         "best_return_mean": 92.0,
         "best_return_std": 2.0,
+        "best_optimism": 1.0,
+        "expert_return_mean": 94.0,
+        "expert_return_std": 0.0,
+        "r_d_mean": 0.02,
+        "r_d_std": 0.04,
         "return_after_convergence": (86 + 95 + 94) / 3,
         "iqm": 269 / 3,
         "env_steps_learner": 1_500,
         "env_steps_demonstrations": 270,
-        "env_steps_expert": 4_000,
+        "env_steps_expert": 12_000,
         "diverged": 0,
         "gymnasium_return_mean": 92.0,
         "gymnasium_difference_max": 0.002,
@@ -207,7 +150,7 @@ def test_summary_of_a_cell_by_hand():
 
 def test_what_never_happened_is_empty_and_every_number_in_the_summary_is_finite():
     row = statistics.summarise(
-        evaluations_of([0, 0, 0], [1, 2, 3]), seeds_of(2), 90.0, max_episodes=None
+        evaluations_of([0, 0, 0], [1, 2, 3]), seeds_table(2), 90.0, max_episodes=None
     )
     for name in (
         "convergence_env_step_median",
@@ -222,14 +165,14 @@ def test_what_never_happened_is_empty_and_every_number_in_the_summary_is_finite(
 
 
 def test_one_seed_has_no_standard_deviation():
-    row = statistics.summarise(evaluations_of([0, 92]), seeds_of(1), 90.0, max_episodes=None)
+    row = statistics.summarise(evaluations_of([0, 92]), seeds_table(1), 90.0, max_episodes=None)
     for name in ("convergence_episode_std", "final_return_std", "best_return_std"):
         assert row[name] is None, name
 
 
 def test_statistics_over_episodes_are_restricted_where_episodes_bind_and_missing_where_steps_do():
     evaluations = evaluations_of([0, 92, 92], [0, 0, 0])
-    seeds = seeds_of(2, episodes=[8, 8])
+    seeds = seeds_table(2, episodes=[8, 8])
     by_episodes = statistics.summarise(evaluations, seeds, 90.0, max_episodes=8)
     assert by_episodes["convergence_episode_restricted"]
     assert by_episodes["convergence_episode_mean"] == pytest.approx((2 + 8) / 2)
@@ -245,7 +188,7 @@ def test_a_diverged_seed_is_no_fast_one():
     """It is restricted at the run's episodes, not at those that it lived."""
     row = statistics.summarise(
         evaluations_of([0, 0, 92], [0]),
-        seeds_of(2, episodes=[100, 2], diverged=[False, True]),
+        seeds_table(2, episodes=[100, 2], diverged=[False, True]),
         90.0,
         max_episodes=100,
     )
@@ -255,7 +198,7 @@ def test_a_diverged_seed_is_no_fast_one():
 def test_a_diverged_seed_stands_at_its_lowest_return_from_then_on():
     row = statistics.summarise(
         evaluations_of([95, 95, 95, 95], [91, 95]),
-        seeds_of(2, diverged=[False, True]),
+        seeds_table(2, diverged=[False, True]),
         90.0,
         max_episodes=None,
     )
@@ -268,7 +211,7 @@ def test_a_diverged_seed_stands_at_its_lowest_return_from_then_on():
 def test_diverged_seeds_are_counted_and_kept():
     row = statistics.summarise(
         evaluations_of([0, 92, 92], [0]),
-        seeds_of(2, diverged=[False, True]),
+        seeds_table(2, diverged=[False, True]),
         90.0,
         max_episodes=None,
     )
@@ -280,9 +223,52 @@ def test_diverged_seeds_are_counted_and_kept():
 def test_a_seed_that_diverged_after_it_converged_is_not_sustained():
     row = statistics.summarise(
         evaluations_of([95, 95], [95]),
-        seeds_of(2, diverged=[False, True]),
+        seeds_table(2, diverged=[False, True]),
         90.0,
         max_episodes=None,
     )
     assert row["converged_fraction"] == 1.0
     assert row["sustained_fraction"] == 0.5
+
+
+def test_seeds_that_all_diverged_at_once_failed():
+    row = statistics.summarise(
+        evaluations_of([-1, 95, 95], [-1, 95, 95]),
+        seeds_table(2, diverged=[True, True]),
+        90.0,
+        max_episodes=None,
+    )
+    assert row["sustained_fraction"] == 0.0
+    assert row["failed_fraction"] == 1.0
+    assert row["final_return_mean"] == -1.0
+
+
+@pytest.mark.parametrize("dipping", [9, 10])
+def test_a_rate_of_dips_has_bounds_only_where_ten_seeds_dip(dipping):
+    curves = [[95, 80, 95] if seed < dipping else [95, 95, 95] for seed in range(20)]
+    row = statistics.summarise(evaluations_of(*curves), seeds_table(20), 90.0, max_episodes=None)
+    assert row["dip_fraction"] == pytest.approx(dipping / 40)
+    assert (row["dip_fraction_low"] is None) == (dipping < 10)
+    # The share of seeds that dip has an interval in any case.
+    assert row["sustained_fraction"] == 1 - dipping / 20
+    assert row["sustained_fraction_low"] < 1 - dipping / 20 < row["sustained_fraction_high"]
+
+
+def test_experts_count_once_each_and_shared_ones_are_paid_once():
+    shared = {"expert": "best", "expert_id": [3, 3], "expert_steps": [8_000, 8_000]}
+    row = statistics.summarise(
+        evaluations_of([0, 92], [95, 95]), seeds_table(2, **shared), 90.0, max_episodes=None
+    )
+    assert row["experts"] == 1
+    assert row["env_steps_expert"] == 8_000
+
+
+def test_seeds_without_one_expert_each_have_none():
+    row = statistics.summarise(
+        evaluations_of([0, 92], [95, 95]),
+        seeds_table(2, expert_id=[None, None], expert_return=[None, None]),
+        90.0,
+        max_episodes=None,
+    )
+    assert row["experts"] is None
+    assert row["expert_return_mean"] is None

@@ -15,6 +15,29 @@ def rows(key):
     return {"evaluations": evaluations, "episodes": seeds.head(0), "seeds": seeds}
 
 
+def seeds_table(count, **columns):
+    """Rows of seeds.parquet of seeds that share no expert; `columns` replace some."""
+    return pl.DataFrame(
+        {
+            "expert": "each",
+            "seed": range(count),
+            "expert_id": range(count),
+            "expert_return": [94.0] * count,
+            "env_steps": [500] * count,
+            "episodes": [7 + seed for seed in range(count)],
+            "demonstration_steps": [90] * count,
+            "expert_steps": [4_000] * count,
+            "diverged": [False] * count,
+            "best_evaluation": [91.0 + 2.0 * seed for seed in range(count)],
+            "best_return": [90.0 + 2.0 * seed for seed in range(count)],
+            "gymnasium_return": [91.0 + seed for seed in range(count)],
+            "gymnasium_difference": [0.001 * seed for seed in range(count)],
+            **columns,
+        },
+        schema_overrides={"expert_id": pl.Int32, "expert_return": pl.Float64},
+    )
+
+
 def save(folder, key, tables=None):
     """Write a cell without policies; returns its folder."""
     cells.save(folder, key, {}, tables or rows(key), {})

@@ -1,0 +1,169 @@
+"""The seeds of finished runs of one configuration, cell by cell, over all of their study seeds."""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import polars as pl
+import polars.selectors as cs
+
+from cmedirl_jax import envs
+from cmedirl_jax.runs import statistics
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.statistics import SeedStatistics
+from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.runs.storage import tables
+
+CellName = tuple[str, int]
+"""A method and its number of demonstrations, 0 for one without."""
+
+_MAY_DIFFER = ("seed", "out", "methods", "n_demos", "grid", "devices", "group", "checkpoint_every")
+
+
+class CellSeeds(NamedTuple):
+    """A cell's seeds, arrays `[seeds]`.
+
+    Attributes:
+        pair: what a seed is paired by: its study's seed and its own number.
+        expert: whose demonstrations it has, -1 for none or several.
+        statistics: of its evaluations by steps.
+        expert_return: of its expert on the evaluation starts; NaN if it has none.
+        best_evaluation: the highest of its evaluations.
+        best_return: of the same policy on fresh starts.
+        evaluations: all rows of the cell's seeds in evaluations.parquet.
+    """
+
+    pair: np.ndarray
+    expert: np.ndarray
+    statistics: SeedStatistics
+    expert_return: np.ndarray
+    best_evaluation: np.ndarray
+    best_return: np.ndarray
+    evaluations: pl.DataFrame
+
+    @property
+    def study(self) -> np.ndarray:
+        """`[seeds]`, the study's seed of each."""
+        return self.pair // 2**32
+
+
+class Pooled(NamedTuple):
+    """Runs that differ in their study's seed and their cells at most.
+
+    Attributes:
+        cells: by name, in the order of the runs' tables.
+        config: of the first run.
+        threshold: return that counts as solved.
+        most: the last environment step of every seed, or None where episodes end them.
+    """
+
+    cells: dict[CellName, CellSeeds]
+    config: dict[str, Any]
+    threshold: float
+    most: int | None
+
+
+def read(folders: Sequence[Path]) -> Pooled:
+    """Read the runs' cells.
+
+    Raises:
+        UserError: if a folder holds no run or a damaged one, the configurations differ, or two runs
+            hold the same seeds.
+    """
+    configs = [run_folder.read(folder)["config"] for folder in folders]
+    found: dict[CellName, list[CellSeeds]] = {}
+    for folder, config in zip(folders, configs, strict=True):
+        _check_alike(folders[0], configs[0], folder, config)
+        with undamaged(folder):
+            threshold = envs.make(config["env"]).spec.reward_threshold
+            for name, cell in _cells(folder, config, threshold).items():
+                found.setdefault(name, []).append(cell)
+    pooled = {name: _joined(parts) for name, parts in found.items()}
+    for (method, _), cell in pooled.items():
+        if np.unique(cell.pair).size < cell.pair.size:
+            raise UserError(f"{folders[-1]}: holds seeds of {method} that another folder holds too")
+    first = configs[0]
+    with undamaged(folders[0]):
+        by_episodes = first["max_episodes"] is not None
+        most = None if by_episodes else int(first["max_steps"])
+        return Pooled(pooled, first, envs.make(first["env"]).spec.reward_threshold, most)
+
+
+def _check_alike(one: Path, first: dict[str, Any], other: Path, config: dict[str, Any]) -> None:
+    for name in sorted(first.keys() | config.keys()):
+        if name not in _MAY_DIFFER and first.get(name) != config.get(name):
+            raise UserError(f"{other}: its {name} is not that of {one}; give runs of one kind")
+
+
+def _cells(folder: Path, config: dict[str, Any], threshold: float) -> dict[CellName, CellSeeds]:
+    run_tables = tables.read(folder, config)
+    by_cell = ["method", "n_demos"]
+    seeds = run_tables["seeds"].partition_by(by_cell, as_dict=True)
+    study, count = int(config["seed"]), int(config["seeds"])
+    cells = {}
+    for (method, n_demos), rows in (
+        run_tables["evaluations"].partition_by(by_cell, as_dict=True, maintain_order=True).items()
+    ):
+        of_cell = seeds[method, n_demos].sort("seed")
+        found = statistics.of_seeds(rows, of_cell["diverged"].to_numpy(), threshold)
+        if found.area.size != count or not np.isfinite(found.area).all():
+            raise UserError(
+                f"{folder}: {method} has no finite returns of {count} seeds; finish the run first"
+            )
+        of_study = pl.col("seed", "expert_id").cast(pl.Int64) + study * 2**32
+        numbers = of_cell.select(of_study, cs.starts_with("best_", "expert_return"))
+        cells[method, n_demos] = CellSeeds(
+            pair=numbers["seed"].to_numpy(),
+            expert=numbers["expert_id"].fill_null(-1).to_numpy(),
+            statistics=found,
+            expert_return=numbers["expert_return"].fill_null(np.nan).to_numpy(),
+            best_evaluation=numbers["best_evaluation"].to_numpy(),
+            best_return=numbers["best_return"].to_numpy(),
+            evaluations=rows.with_columns(pair=study * 2**32 + pl.col("seed").cast(pl.Int64)),
+        )
+    return cells
+
+
+def _joined(parts: list[CellSeeds]) -> CellSeeds:
+    def column(name: str) -> np.ndarray:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    return CellSeeds(
+        pair=column("pair"),
+        expert=column("expert"),
+        statistics=SeedStatistics(
+            *(np.concatenate(leaf) for leaf in zip(*(x.statistics for x in parts), strict=True))
+        ),
+        expert_return=column("expert_return"),
+        best_evaluation=column("best_evaluation"),
+        best_return=column("best_return"),
+        evaluations=pl.concat(part.evaluations for part in parts),
+    )
+
+
+@contextlib.contextmanager
+def undamaged(folder: Path) -> Iterator[None]:
+    """Turn any error about a run's values into a user's error."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, pl.exceptions.PolarsError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise UserError(f"{folder}: holds a damaged file ({reason})") from error
+
+
+def aligned(cell: CellSeeds, reference: CellSeeds) -> tuple[np.ndarray, np.ndarray]:
+    """Positions `[pairs]` in each cell of the seeds that both have, in the same order."""
+    _, mine, others = np.intersect1d(cell.pair, reference.pair, return_indices=True)
+    return mine, others
+
+
+def clusters(
+    cell: CellSeeds, reference: CellSeeds, mine: np.ndarray, others: np.ndarray
+) -> np.ndarray | None:
+    """`[pairs]`, which pairs share an expert; None if neither cell says."""
+    for experts in (cell.expert[mine], reference.expert[others]):
+        if (experts >= 0).all():
+            return experts
+    return None
