@@ -5,7 +5,7 @@ import re
 import sys
 from collections.abc import Collection
 
-COMMANDS = ("run_grid", "report", "compare", "optimal_return")
+COMMANDS = ("run_grid", "report", "compare", "claims", "optimal_return")
 
 
 def check_command(package: str, commands: Collection[str]) -> None:

@@ -8,9 +8,9 @@ by Holm's method.
 
 import dataclasses
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import polars as pl
@@ -21,36 +21,12 @@ from rich.table import Table
 from cmedirl_jax.runs import paired
 from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.statistics import SeedStatistics
 from cmedirl_jax.runs.storage import outputs
 from experiments import pooled
+from experiments.measures import AREA, FINAL, STABLE, STEPS, Measure
 from experiments.pooled import CellName, CellSeeds
 
-
-class Measure(NamedTuple):
-    """A number of each seed.
-
-    Attributes:
-        of: `(statistics, the last step) -> [seeds]`.
-        margin: differences within it are as good as none.
-        form: of a printed difference.
-    """
-
-    of: Callable[[SeedStatistics, int], np.ndarray]
-    margin: float
-    form: str
-
-
-MEASURES = {
-    # A seed that never converged counts as converged at the last step.
-    "convergence_env_step": Measure(
-        lambda seeds, most: np.minimum(seeds.convergence_env_step, most), 500.0, "{:+,.0f}"
-    ),
-    "area": Measure(lambda seeds, most: seeds.area, 1.0, "{:+.1f}"),
-    "final_return": Measure(lambda seeds, most: seeds.final_return, 1.0, "{:+.1f}"),
-    "stayed_solved": Measure(lambda seeds, most: seeds.sustained, 0.02, "{:+.2f}"),
-}
-"""The measures compared."""
+MEASURES = (STEPS, AREA, FINAL, STABLE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +69,7 @@ def compare(folders: Sequence[Path], against: str) -> pl.DataFrame:
             there is no cell of the method `against`, or none to compare with it.
     """
     runs = pooled.read(folders)
-    if runs.most is None:
+    if runs.by_episodes:
         raise UserError(f"{folders[0]}: a run over episodes, whose seeds end at different steps")
     if runs.config["seeds"] < 2:
         raise UserError(f"{folders[0]}: one seed has no interval")
@@ -102,7 +78,7 @@ def compare(folders: Sequence[Path], against: str) -> pl.DataFrame:
         cell, reference = runs.cells[name], runs.cells[other]
         for measure in MEASURES:
             labels = {"method": name[0], "n_demos": name[1]}
-            labels |= {"against": other[0], "against_n_demos": other[1], "measure": measure}
+            labels |= {"against": other[0], "against_n_demos": other[1], "measure": measure.name}
             rows.append(labels | _difference(measure, cell, reference, runs.most))
     adjusted = paired.holm(np.array([row["p_value"] for row in rows]))
     return pl.DataFrame([row | {"p_holm": p} for row, p in zip(rows, adjusted, strict=True)])
@@ -134,12 +110,13 @@ def _pairs(
     return between + across
 
 
-def _difference(measure: str, cell: CellSeeds, reference: CellSeeds, most: int) -> dict[str, Any]:
+def _difference(
+    measure: Measure, cell: CellSeeds, reference: CellSeeds, most: int
+) -> dict[str, Any]:
     mine, others = pooled.aligned(cell, reference)
-    of, margin, _ = MEASURES[measure]
     found = paired.compare(
-        np.asarray(of(cell.statistics, most), float)[mine],
-        np.asarray(of(reference.statistics, most), float)[others],
+        measure.of(cell, most)[mine],
+        measure.of(reference, most)[others],
         pooled.clusters(cell, reference, mine, others),
     )
     return {
@@ -148,7 +125,7 @@ def _difference(measure: str, cell: CellSeeds, reference: CellSeeds, most: int) 
         "difference_low": found.mean.low,
         "difference_high": found.mean.high,
         "p_value": found.p_value,
-        "equivalence": paired.equivalence(found, margin),
+        "equivalence": paired.equivalence(found, measure.margin),
     }
 
 
@@ -158,12 +135,12 @@ def shown(table: pl.DataFrame) -> Table:
     printed.add_column("cell")
     printed.add_column("against")
     for measure in MEASURES:
-        printed.add_column(measure.replace("_", " "), justify="right")
+        printed.add_column(measure.name.replace("_", " "), justify="right")
     cells = ["method", "n_demos", "against", "against_n_demos"]
     for (method, n_demos, against, other), group in table.group_by(cells, maintain_order=True):
         row = []
-        for found in group.iter_rows(named=True):
-            form = MEASURES[found["measure"]].form.format
+        for measure, found in zip(MEASURES, group.iter_rows(named=True), strict=True):
+            form = measure.form.format
             mean, low, high = (form(found[f"difference{end}"]) for end in ("", "_low", "_high"))
             row.append(f"{mean} \\[{low}, {high}]\np {found['p_holm']:.4f}, {found['equivalence']}")
         printed.add_row(_name(method, n_demos), _name(against, other), *row)

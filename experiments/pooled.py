@@ -56,13 +56,15 @@ class Pooled(NamedTuple):
         cells: by name, in the order of the runs' tables.
         config: of the first run.
         threshold: return that counts as solved.
-        most: the last environment step of every seed, or None where episodes end them.
+        most: the last environment step that a seed can reach.
+        by_episodes: whether episodes end the seeds, at different steps.
     """
 
     cells: dict[CellName, CellSeeds]
     config: dict[str, Any]
     threshold: float
-    most: int | None
+    most: int
+    by_episodes: bool
 
 
 def read(folders: Sequence[Path]) -> Pooled:
@@ -86,9 +88,11 @@ def read(folders: Sequence[Path]) -> Pooled:
             raise UserError(f"{folders[-1]}: holds seeds of {method} that another folder holds too")
     first = configs[0]
     with undamaged(folders[0]):
-        by_episodes = first["max_episodes"] is not None
-        most = None if by_episodes else int(first["max_steps"])
-        return Pooled(pooled, first, envs.make(first["env"]).spec.reward_threshold, most)
+        spec = envs.make(first["env"]).spec
+        episodes, most = first["max_episodes"], first["max_steps"]
+        if most is None:
+            most = episodes * spec.max_episode_steps
+        return Pooled(pooled, first, spec.reward_threshold, int(most), episodes is not None)
 
 
 def _check_alike(one: Path, first: dict[str, Any], other: Path, config: dict[str, Any]) -> None:

@@ -49,7 +49,7 @@ PRESETS: dict[str, StudyConfig] = {
         n_demos=(5,),
         seeds=8,
         max_steps=500,
-        experts=ExpertSettings(seeds=8, steps=6_000, trajectories=64),
+        experts=ExpertSettings(steps=6_000, trajectories=64),
         settings=Settings(
             hot_start=HotStartHParams(steps=200), tabular=TabularSettings(states=25, steps=30)
         ),

@@ -72,8 +72,9 @@ class StudyConfig:
             episodes (the paper: 100).
         evaluation_starts_episodes: Start states of the evaluations by episodes.
         out: Folder of the results; default results/PRESET, or results/PRESET-full.
-        expert: Who demonstrates: each learner has an expert of its own, or all share the best one
-            that solved the task, the median one, or all of them alike.
+        expert: Who demonstrates: each learner has an expert of its own (they share where there are
+            fewer), or all share the best one that solved the task, the median one, or all of them
+            alike.
         demos: A demonstrations file to learn from; no experts are trained, and their options are
             not read.
         check_demos: What is asked of that file. dynamics: that each step is the task's own, where

@@ -250,7 +250,8 @@ def _rewards(evaluations: pl.DataFrame) -> dict[str, Any]:
     last = (
         evaluations.filter(pl.col("r_d_std").is_not_null())
         .sort("env_step")
-        .group_by("seed")
+        # In order: sums of floats depend on it.
+        .group_by("seed", maintain_order=True)
         .agg(pl.col("r_d_mean", "r_d_std").last())
     )
     return {"r_d_mean": last["r_d_mean"].mean(), "r_d_std": last["r_d_std"].mean()}

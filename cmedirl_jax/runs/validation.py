@@ -72,14 +72,14 @@ class Plan(NamedTuple):
         """Share a pool among the run's learners.
 
         Raises:
-            UserError: if it holds too few demonstrations, or has experts for fewer learners.
+            UserError: if it holds too few demonstrations, or does not say whose they are.
         """
         agent = self.settings.agent
         try:
             shared = pools.of_learners(pool, self.seeds, agent.discount, agent.reward_scale)
         except ValueError as error:
             raise UserError(
-                f"--seeds: {self.folder / 'demonstrations'}: {error}; give another folder to --out"
+                f"--out: {self.folder / 'demonstrations'}: {error}; give another folder"
             ) from error
         _check_enough(self.asked, shared.data.episodes.start.shape[1])
         return shared
@@ -181,13 +181,7 @@ def check(config: StudyConfig) -> None:
     _check_parts(config, env, capacity)
     if config.demos is None:
         asked = cells.asked(config.methods, config.n_demos)
-        experts = config.resolved_experts
-        _check_enough(asked, experts.trajectories)
-        if experts.which == "each" and experts.seeds < config.seeds:
-            raise UserError(
-                f"--experts.seeds: {experts.seeds} experts are too few for {config.seeds} learners "
-                "with one each; give as many, or another --expert"
-            )
+        _check_enough(asked, config.resolved_experts.trajectories)
 
 
 def _check_parts(config: StudyConfig, env: Env, capacity: int) -> None:

@@ -51,7 +51,8 @@ def test_paper_is_the_papers_letter():
     assert agent.actor_learning_rate == agent.critic_learning_rate == 1e-5
     assert settings.reward.learning_rate == 1e-5
     assert settings.schedule.batch_size == settings.reward_batches.batch_size == 32
-    assert settings.schedule.replay_capacity == 10_000
+    assert settings.schedule.recent == 10_000
+    assert settings.schedule.replay_capacity is settings.reward_batches.recent is None
     assert (settings.schedule.target_period, agent.tau) == (300, 1.0)
     assert agent.bootstrap_at_termination
     assert agent.pre_activation_penalty == 0.0
@@ -171,3 +172,27 @@ def test_everything_about_the_learned_reward_has_a_dotted_name():
     assert settings.gail.form == "logit D"
     assert settings.exploration.epsilon_greedy.noise == 0.2
     validation.check(config)
+
+
+def test_the_full_grid_is_the_papers_sweep_under_either_preset():
+    tuned, paper = parse(["--grid", "full"]), parse(["--grid", "full", "--preset", "paper"])
+    assert tuned.n_demos == paper.n_demos == (1, 5, 10, 50, 100, 200)
+    assert (tuned.max_steps, paper.max_steps) == (20_000, None)
+    assert tuned == dataclasses.replace(
+        PRESETS["tuned"], grid="full", n_demos=tuned.n_demos, max_steps=20_000
+    )
+    assert tuned.folder == Path("results/tuned-full")
+    assert parse(["--grid", "full", "--n-demos", "7"]).n_demos == (7,)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], ("each", 100, 14_000, 200)),
+        (["--seeds", "7", "--n-demos", "300"], ("each", 7, 14_000, 300)),
+        (["--expert", "best"], ("best", 16, 14_000, 1_024)),
+        (["--expert", "all", "--experts.seeds", "3"], ("all", 3, 14_000, 1_024)),
+    ],
+)
+def test_experts_are_as_many_as_their_learners_need(arguments, expected):
+    assert parse(arguments).resolved_experts == expected

@@ -117,7 +117,10 @@ def refused(main, tmp_path, capsys):
         ("--methods ddpg ddpg", "--methods: give one or more, each once"),
         ("--n-demos", "--n-demos: give one or more, each once"),
         ("--n-demos 5 5", "--n-demos: give one or more, each once"),
-        ("--n-demos 2000", "--n-demos: 2000 asked, the pool holds 1024"),
+        (
+            "--n-demos 200 --experts.trajectories 64",
+            "--n-demos: 200 asked, the pool holds 64",
+        ),
         (
             "--env Walker2d-v5",
             "--env: unknown environment 'Walker2d-v5'; there are: MountainCarContinuous-v0",
@@ -406,7 +409,8 @@ def test_a_run_evaluates_every_seed_of_every_cell_from_step_0_on(smoke):
     ]
     losses = ("q_mean", "critic_loss")
     of_rewards = ("demonstration_reward", "background_reward", "effective_sample_size")
-    assert table.drop(*losses, *of_rewards).null_count().sum_horizontal().item() == 0
+    added = ("r_d_mean", "r_d_std")
+    assert table.drop(*losses, *added, *of_rewards).null_count().sum_horizontal().item() == 0
     learned = table.filter(
         pl.col("method").str.ends_with("me-ddpg"), pl.col("env_step") == STEPS[-1]
     )
@@ -429,14 +433,21 @@ def test_only_methods_that_use_demonstrations_name_an_expert(smoke):
     for name in TABLES:
         table = pl.read_parquet(smoke[0] / name)
         assert set(table.select("study", "method", "n_demos", "expert").unique().rows()) == {
-            (0, method, n_demos, "best" if n_demos else "none") for method, n_demos in CELLS
+            (0, method, n_demos, "each" if n_demos else "none") for method, n_demos in CELLS
         }
 
 
 def test_demonstrations_are_a_valid_pool_of_the_size_asked(smoke, spec):
     pool = demonstrations.load(smoke[0] / "demonstrations" / "pool.npz", spec)
-    assert demonstrations.returns(pool).size == 64
-    assert pool.metadata["expert"] == "best"
+    able = pool.metadata["experts_demonstrating"]
+    assert demonstrations.returns(pool).size == 64 * len(able)
+    assert pool.metadata["expert"] == "each"
+    seeds = pl.read_parquet(smoke[0] / "seeds.parquet").filter(pl.col("n_demos") > 0)
+    # Each learner has its own expert, or the next one that solved the task.
+    for seed, expert, score in seeds.select("seed", "expert_id", "expert_return").rows():
+        expected = min((one for one in able if one >= seed), default=able[0])
+        assert expert == expected
+        assert score == pytest.approx(pool.metadata["expert_returns"][able.index(expert)])
     assert demonstrations.returns(pool).mean() > spec.reward_threshold
 
 
@@ -446,7 +457,8 @@ def test_the_summary_has_a_row_per_cell_and_counts_the_steps(smoke, spec):
     assert summary["seeds"].to_list() == [SEEDS] * 4
     assert summary["diverged"].to_list() == [0] * 4
     assert summary["env_steps_learner"].to_list() == [SEEDS * STEPS[-1]] * 4
-    assert summary["env_steps_expert"].to_list() == [0, *[8 * 6_000] * 3]
+    able = summary["experts"][1]
+    assert summary["env_steps_expert"].to_list() == [0, *[SEEDS * (8 * 6_000 // able)] * 3]
     # The seeds of every method that uses demonstrations draw the same ones.
     without, *drawn = summary["env_steps_demonstrations"]
     assert without == 0
@@ -464,7 +476,7 @@ def test_policies_and_rewards_of_all_seeds_are_kept_and_agree_with_gymnasium(smo
     seeds = pl.read_parquet(folder / "seeds.parquet")
     assert seeds["gymnasium_difference"].max() < 1e-3
     hot_started = seeds.filter(pl.col("method").str.starts_with("hs-"))
-    assert hot_started["gymnasium_return"].min() > 90.0
+    assert hot_started["gymnasium_return"].min() > 80.0
 
 
 def test_a_finished_run_is_left_alone(smoke, main, monkeypatch, capsys):
@@ -612,7 +624,7 @@ def test_policies_and_rewards_of_a_run_are_functions(smoke, env):
 def test_a_finished_run_refuses_another_configuration(smoke, main, capsys):
     before = snapshot(smoke[0])
     assert main(*SMOKE, "--out", smoke[0], "--expert", "median") == 2
-    assert "--expert best, not median" in capsys.readouterr().err
+    assert "--expert each, not median" in capsys.readouterr().err
     assert snapshot(smoke[0]) == before
 
 

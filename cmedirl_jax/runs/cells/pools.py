@@ -38,7 +38,8 @@ def of_learners(
     """Share a pool among learners.
 
     With an expert each, learner i has expert i. If that one failed, it has the next that solved the
-    task. Otherwise all learners draw from the whole pool.
+    task; where there are more learners than experts, they begin again with the first. Otherwise all
+    learners draw from the whole pool.
 
     Args:
         pool: valid; its metadata are what `experts.make_pool` writes, or a user's.
@@ -47,8 +48,7 @@ def of_learners(
         reward_scale: likewise.
 
     Raises:
-        ValueError: if the metadata of a pool with an expert for each learner does not fit the pool,
-            or it has experts for fewer learners.
+        ValueError: if the metadata of a pool with an expert for each learner does not fit the pool.
     """
     data = hot_start.data(pool, discount, reward_scale)
     metadata, episodes = pool.metadata, data.episodes
@@ -57,11 +57,15 @@ def of_learners(
     steps = metadata.get("expert_env_steps", 0)
     if metadata.get("expert") == EACH:
         trained = metadata.get("experts_trained", 0)
-        if not experts or episodes.start.size % len(experts) or returns.size != len(experts):
+        if (
+            not experts
+            or episodes.start.size % len(experts)
+            or returns.size != len(experts)
+            or type(trained) is not int
+            or trained <= experts[-1]
+        ):
             raise ValueError("its metadata do not say whose its episodes are")
-        if learners > trained:
-            raise ValueError(f"it has experts for {trained} learners, not for {learners}")
-        who = np.searchsorted(experts, np.arange(learners)) % len(experts)
+        who = np.searchsorted(experts, np.arange(learners) % trained) % len(experts)
         blocks = [leaf.reshape(len(experts), -1)[who] for leaf in episodes]
         expert, expert_return = np.asarray(experts)[who], returns[who]
         # What it takes to get one expert that solves the task.

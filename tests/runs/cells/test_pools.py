@@ -30,6 +30,10 @@ def test_with_an_expert_each_a_learner_draws_from_its_own():
         np.testing.assert_array_equal(shared.data.episodes.length[learner], length[block])
 
 
+def test_more_learners_than_experts_begin_again_with_the_first():
+    np.testing.assert_array_equal(of_learners(7, **EACH)[1].expert, [0, 2, 2, 0, 0, 2, 2])
+
+
 def test_an_expert_that_solves_the_task_costs_the_failed_ones_too():
     np.testing.assert_array_equal(of_learners(2, **EACH)[1].expert_steps, [2_000, 2_000])
 
@@ -53,7 +57,8 @@ def test_otherwise_all_learners_draw_from_the_whole_pool(metadata, expert, score
 @pytest.mark.parametrize(
     ("learners", "metadata", "message"),
     [
-        (5, EACH, "it has experts for 4 learners, not for 5"),
+        (2, EACH | {"experts_trained": 2}, "do not say whose its episodes are"),
+        (2, EACH | {"experts_trained": None}, "do not say whose its episodes are"),
         (2, EACH | {"experts_demonstrating": [0, 1, 2, 3]}, "do not say whose its episodes are"),
         (2, EACH | {"experts_demonstrating": []}, "do not say whose its episodes are"),
         (2, EACH | {"expert_returns": [94.0]}, "do not say whose its episodes are"),

@@ -1,0 +1,113 @@
+"""`python -m experiments.claims FOLDER ...`: a verdict on each claim of the paper.
+
+The rules were written down before the study seeds 1 and 2 were trained. They say what each claim
+would look like in the tables:
+
+- near: the 95% interval of return minus the expert's, on the same starts, lies above -5.
+- converged: the first evaluation with a mean return at the threshold.
+- about n episodes: the interval of the median lies within a factor of 1.5 of n.
+- faster, better, exceeds, more stable: the mean difference of pairs has that sign, and a p-value of
+  at most 0.05 after Holm's correction over all tests of the page.
+- no better, as stable: the 90% interval of the difference lies within the margin (500 environment
+  steps, 1 of return, 0.02 of the share of seeds), or the difference has the other sign.
+
+What neither shows is inconclusive, and so is a difference that has opposite signs, each significant
+by itself, in two study seeds. Study seeds are pooled; seeds that share an expert are resampled
+together. A claim of several parts is supported if all are, not supported if none is, supported in
+part if some are and some are not, and inconclusive otherwise.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.runs.storage import outputs
+from experiments import pooled, verdicts
+from experiments.pooled import Pooled
+from experiments.verdicts import Claim
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Which runs.
+
+    Attributes:
+        folders: Folders of runs that share their settings; they may differ in the study's seed, the
+            cells and the budget. Claims about episodes are read off runs with --max-episodes where
+            there are any.
+        out: A file for the verdicts; default they are printed.
+    """
+
+    folders: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    out: Path | None = None
+
+
+@ending.in_a_line("claims")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    options = tyro.cli(
+        Options, prog="python -m experiments.claims", description=__doc__, args=arguments
+    )
+    outputs.check("out", options.out)
+    if not options.folders:
+        raise UserError("FOLDERS: give the folder of a run")
+    text = of_folders(options.folders)
+    if options.out is None:
+        screen.say(screen.console(), text)
+    else:
+        outputs.write(options.out, text.encode())
+    return 0
+
+
+def of_folders(folders: Sequence[Path]) -> str:
+    """The page of verdicts.
+
+    Raises:
+        UserError: as `pooled.read`, or if the runs' settings differ.
+    """
+    kinds: dict[str, list[Path]] = {}
+    first = run_folder.read(folders[0])["config"]
+    for folder in folders:
+        config = run_folder.read(folder)["config"]
+        if config.get("settings") != first.get("settings"):
+            raise UserError(f"{folder}: its settings are not those of {folders[0]}")
+        kind = f"{config['max_steps']} {config['max_episodes']} {config['evaluate_every']}"
+        kinds.setdefault(kind, []).append(folder)
+    runs = [pooled.read(alike) for alike in kinds.values()]
+    return page(runs, verdicts.judge(runs))
+
+
+def page(runs: Sequence[Pooled], claims: Sequence[Claim]) -> str:
+    """The verdicts as Markdown."""
+    config = runs[0].config
+    lines = [f"# The paper's claims, under `{config['preset']}`", "", "From these runs:", ""]
+    for run in runs:
+        budget = f"{run.most:,} steps"
+        if run.by_episodes:
+            budget = f"{run.config['max_episodes']} episodes"
+        studies = sorted({int(study) for cell in run.cells.values() for study in cell.study})
+        cells = ", ".join(f"{method} {n}" if n else method for method, n in run.cells)
+        lines.append(
+            f"- {run.config['seeds']} seeds x {budget}, study seeds "
+            f"{', '.join(map(str, studies))}, experts: {config['expert']}; {cells}"
+        )
+    lines += ["", "| | claim | verdict |", "| --- | --- | --- |"]
+    lines += [f"| {claim.name} | {claim.text} | **{claim.verdict}** |" for claim in claims]
+    lines += ["", "What was measured. Brackets are 95% intervals; p is Holm's.", ""]
+    for claim in claims:
+        lines += [f"## {claim.name}: {claim.verdict}", "", f"{claim.text}.", ""]
+        lines += [f"- {part.outcome}: {part.measured}" for part in claim.parts]
+        lines += [] if claim.parts else [f"- {claim.why}"]
+        lines.append("")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
