@@ -1,10 +1,10 @@
-"""`python -m experiments.report FOLDER`: a run's tables, summary and figures, from its cells."""
+"""`python -m experiments.report FOLDER`: a run's tables, summary, verdicts and figures."""
 
 import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import polars as pl
 import tyro
@@ -13,11 +13,11 @@ from cmedirl_jax import envs
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.runs import statistics
 from cmedirl_jax.runs.console import ending, screen, streams
+from cmedirl_jax.runs.storage import cells, outputs, tables
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.runs.storage import folder as run_folder
-from cmedirl_jax.runs.storage import outputs, tables
 from cmedirl_jax.training.methods import METHODS
-from experiments import figures
+from experiments import claims, figures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +60,9 @@ class Report(NamedTuple):
 
 
 def report(folder: Path, redraw: bool = False) -> Report:
-    """Write the tables, the summary and the figures of the cells that config.json asks for.
+    """Write the tables, summary, verdicts and figures of the cells that config.json asks for.
+
+    The verdicts wait until every cell is finished.
 
     A file that would be as it is stays untouched; a figure is drawn if the summary has changed, it
     is gone, or `redraw` says so.
@@ -74,16 +76,24 @@ def report(folder: Path, redraw: bool = False) -> Report:
     threshold = envs.make(config["env"]).spec.reward_threshold
     summary = summarise(run_tables, threshold, config["max_episodes"])
     tables.write(folder, run_tables)
-    # Figures of another summary go before this one comes: those that are there belong to it.
+    # Figures and verdicts of another summary go before this one comes: those there belong to it.
     path, content = folder / "summary.csv", summary.write_csv().encode()
     if not path.is_file() or path.read_bytes() != content:
         for figure in (folder / "figures").glob("figure*"):
             figure.unlink()
+        (folder / "claims.md").unlink(missing_ok=True)
     outputs.write(path, content)
+    if config["seeds"] > 1 and summary["seeds"].to_list() == [config["seeds"]] * _asked(config):
+        outputs.write(folder / "claims.md", claims.of_folders([folder]).encode())
     files = figures.files(folder / "figures", summary).values()
     if not redraw and all(file.exists() for of_figure in files for file in of_figure):
         return Report(summary, [])
     return Report(summary, _draw(folder, run_tables, summary, threshold))
+
+
+def _asked(config: dict[str, Any]) -> int:
+    """How many cells a configuration asks for."""
+    return len(cells.asked(config["methods"], config["n_demos"]))
 
 
 def summarise(

@@ -116,7 +116,10 @@ def _read_first(arguments: Sequence[str]) -> argparse.Namespace:
 
 def summary_table(summary: pl.DataFrame) -> Table:
     """The summary as a paper would print it."""
-    table = Table(title=f"{summary['seeds'].max()} seeds per row; 95% intervals", box=box.SIMPLE)
+    title = f"{summary['seeds'].max()} seeds per row; 95% intervals"
+    if summary["experts"].max() == 1:
+        title += ", of this one expert"
+    table = Table(title=title, box=box.SIMPLE)
     table.add_column("method")
     table.add_column("N_T", justify="right")
     for name in (
