@@ -1,6 +1,5 @@
 """The paper's Figures 3, 4 and 5, drawn from the tables of a run."""
 
-import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,12 @@ from cmedirl_jax.runs.console import streams
 from cmedirl_jax.runs.drawing import Axes, Figure
 from cmedirl_jax.training.methods import METHODS
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart.
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#000000")
+# Okabe and Ito's palette, which colour-blind readers can tell apart; wine in place of its yellow,
+# which is faint on white.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#882255", "#000000")
+STYLES = ("-", "--", "-.", ":")
+MOST_CURVES = 5
+"""More than these in one panel cannot be told apart: each method gets a panel of its own."""
 
 
 def draw(
@@ -22,7 +25,6 @@ def draw(
     evaluations: pl.DataFrame,
     episodes: pl.DataFrame,
     summary: pl.DataFrame,
-    expert_return: float | None,
     threshold: float,
     say: Callable[[str], None] = streams.complain,
 ) -> list[Path]:
@@ -33,7 +35,6 @@ def draw(
         evaluations: the run's table.
         episodes: the run's table.
         summary: a row for each cell.
-        expert_return: mean return of the demonstrations; None without any.
         threshold: return that counts as solved.
         say: called with a line for each figure that cannot be drawn; the others are drawn.
 
@@ -41,12 +42,15 @@ def draw(
         The files that were written.
     """
     largest = pl.col("n_demos").is_in([0, max(evaluations["n_demos"])])
+    shown = evaluations.filter(largest)
+    # The same starts as the evaluations'.
+    expert = summary["expert_return_mean"].cast(pl.Float64).mean()
+    expert = None if expert is None else float(expert)  # type: ignore[arg-type]
     figures = {
-        "figure3": lambda: average_return(
-            evaluations.filter(largest), episodes.filter(largest), expert_return, threshold
-        ),
+        "figure3": lambda: average_return(shown, episodes.filter(largest), expert, threshold),
+        "survival": lambda: survival(shown, threshold),
         "figure4": lambda: convergence(summary),
-        "figure5": lambda: return_after_convergence(summary, expert_return),
+        "figure5": lambda: return_after_convergence(summary, expert),
     }
     paths = []
     for name, of_figure in files(folder, summary).items():
@@ -57,7 +61,7 @@ def draw(
 
 def files(folder: Path, summary: pl.DataFrame) -> dict[str, list[Path]]:
     """The files of each figure that the cells of `summary` allow."""
-    names = ["figure3"]
+    names = ["figure3", "survival"]
     if summary.filter(pl.col("n_demos") > 0)["n_demos"].n_unique() > 1:
         names += ["figure4", "figure5"]
     return {name: [folder / f"{name}.png", folder / f"{name}.svg"] for name in names}
@@ -66,7 +70,12 @@ def files(folder: Path, summary: pl.DataFrame) -> dict[str, list[Path]]:
 def average_return(
     evaluations: pl.DataFrame, episodes: pl.DataFrame, expert: float | None, threshold: float
 ) -> Figure:
-    """Figure 3: noise-free return over environment steps; behaviour return over episodes."""
+    """Figure 3: noise-free return over environment steps; behaviour return over episodes.
+
+    With many methods a panel for each, over environment steps.
+    """
+    if evaluations["method"].n_unique() > MOST_CURVES:
+        return _panels(evaluations, expert, threshold)
     figure = Figure(figsize=(10, 4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     for method, line in _lines(evaluations).items():
@@ -88,9 +97,7 @@ def average_return(
                 line,
             )
     for axes in (left, right):
-        if expert is not None:
-            axes.axhline(expert, color="0.4", linestyle="--", linewidth=1, label="demonstrations")
-        axes.axhline(threshold, color="0.7", linestyle=":", linewidth=1, label="solved")
+        _levels(axes, expert, threshold)
     left.set(
         title="Evaluation without exploration noise",
         xlabel="environment steps",
@@ -103,6 +110,61 @@ def average_return(
     figure.suptitle(
         f"Mean over {seeds} seeds and its 95% interval; {n_demos} demonstrations", fontsize=10
     )
+    return figure
+
+
+def _panels(evaluations: pl.DataFrame, expert: float | None, threshold: float) -> Figure:
+    """Noise-free return over environment steps, a panel for each method beside the first one."""
+    lines = _lines(evaluations)
+    columns = 4
+    rows = -(-len(lines) // columns)
+    figure = Figure(figsize=(11, 2.4 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
+    by_steps = evaluations.filter(pl.col("protocol") == "steps")
+    first = next(iter(lines))
+    for method, axes in zip(lines, panels, strict=False):
+        if method != first:
+            grey = {"color": "0.6", "linestyle": "-"}
+            reference = by_steps.filter(pl.col("method") == first)
+            _band(axes, reference, "env_step", "return_mean", first, grey)
+        one = by_steps.filter(pl.col("method") == method)
+        _band(axes, one, "env_step", "return_mean", method, lines[method] | {"linestyle": "-"})
+        _levels(axes, expert, threshold)
+        axes.set_title(METHODS[method].label or method, fontsize=10)
+    for axes in list(panels)[len(lines) :]:
+        axes.set_axis_off()
+    figure.supxlabel("environment steps", fontsize=10)
+    figure.supylabel("average return without noise", fontsize=10)
+    seeds = evaluations["seed"].n_unique()
+    label = METHODS[first].label or first
+    figure.suptitle(
+        f"Mean over {seeds} seeds and its 95% interval; grey: {label}; dashed: experts; dotted: "
+        "solved",
+        fontsize=10,
+    )
+    return figure
+
+
+def survival(evaluations: pl.DataFrame, threshold: float) -> Figure:
+    """The share of seeds that have not solved the task yet, over environment steps."""
+    figure = Figure(figsize=(6.5, 4), layout="constrained")
+    axes = figure.subplots()
+    by_steps = evaluations.filter(pl.col("protocol") == "steps")
+    for method, line in _lines(evaluations).items():
+        rows = by_steps.filter(pl.col("method") == method)
+        if rows["env_step"].max() == 0:
+            continue
+        times = rows.group_by("seed", maintain_order=True).agg(
+            pl.col("env_step").filter(pl.col("return_mean") >= threshold).min()
+        )
+        left = intervals.survival(times["env_step"].fill_null(np.inf).cast(pl.Float64).to_numpy())
+        at = np.r_[0.0, left.time, float(rows["env_step"].max())]  # type: ignore[arg-type]
+        share, low, high = (np.r_[1.0, x, x[-1]] for x in (left.share, left.low, left.high))
+        axes.step(at, share, where="post", **line, label=METHODS[method].label or method)
+        axes.fill_between(at, low, high, step="post", color=line["color"], alpha=0.15, linewidth=0)
+    axes.set(xlabel="environment steps", ylabel="share of seeds not solved yet", ylim=(-0.02, 1.02))
+    _legend(figure, axes)
+    figure.suptitle("Kaplan-Meier curves, with pointwise 95% intervals", fontsize=10)
     return figure
 
 
@@ -126,8 +188,7 @@ def return_after_convergence(summary: pl.DataFrame, expert: float | None) -> Fig
     figure = Figure(figsize=(5.5, 4), layout="constrained")
     axes = figure.subplots()
     _over_demonstrations(axes, summary, "return_after_convergence")
-    if expert is not None:
-        axes.axhline(expert, color="0.4", linestyle="--", linewidth=1, label="demonstrations")
+    _levels(axes, expert, None)
     axes.set(ylabel="average return after convergence")
     _legend(figure, axes)
     figure.suptitle("Mean over the seeds that converged and its 95% interval", fontsize=10)
@@ -192,6 +253,14 @@ def _band(
     )
 
 
+def _levels(axes: Axes, expert: float | None, threshold: float | None) -> None:
+    """Lines at the experts' return and at the threshold."""
+    if expert is not None:
+        axes.axhline(expert, color="0.4", linestyle="--", linewidth=1, label="experts")
+    if threshold is not None:
+        axes.axhline(threshold, color="0.7", linestyle=":", linewidth=1, label="solved")
+
+
 def _legend(figure: Figure, axes: Axes) -> None:
     """One legend for the figure, below it, where it hides nothing."""
     handles, labels = axes.get_legend_handles_labels()
@@ -200,10 +269,11 @@ def _legend(figure: Figure, axes: Axes) -> None:
 
 
 def _lines(table: pl.DataFrame) -> dict[str, dict[str, Any]]:
-    """Each method's line: a colour of its own, dashed once the palette is used up."""
-    methods = table["method"].unique(maintain_order=True)
-    styles = itertools.product(("-", "--", ":"), COLOURS)
-    return {
-        method: {"color": colour, "linestyle": style}
-        for method, (style, colour) in zip(methods, styles, strict=False)
-    }
+    """Each method's line: the same colour and style in every figure, told apart in grey too."""
+    order = [*METHODS, *sorted(set(table["method"]) - set(METHODS))]
+    lines = {}
+    for method in table["method"].unique(maintain_order=True):
+        index = order.index(method)
+        style = STYLES[(index + index // len(COLOURS)) % len(STYLES)]
+        lines[method] = {"color": COLOURS[index % len(COLOURS)], "linestyle": style}
+    return lines

@@ -10,11 +10,9 @@ import polars as pl
 import tyro
 
 from cmedirl_jax import envs
-from cmedirl_jax.data import demonstrations
 from cmedirl_jax.runs import statistics
 from cmedirl_jax.runs.console import ending, screen, streams
 from cmedirl_jax.runs.storage import cells, outputs, tables
-from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.training.methods import METHODS
 from experiments import claims, figures
@@ -79,7 +77,7 @@ def report(folder: Path, redraw: bool = False) -> Report:
     # Figures and verdicts of another summary go before this one comes: those there belong to it.
     path, content = folder / "summary.csv", summary.write_csv().encode()
     if not path.is_file() or path.read_bytes() != content:
-        for figure in (folder / "figures").glob("figure*"):
+        for figure in (folder / "figures").glob("*.*"):
             figure.unlink()
         (folder / "claims.md").unlink(missing_ok=True)
     outputs.write(path, content)
@@ -125,15 +123,12 @@ def _draw(
     summary: pl.DataFrame,
     threshold: float,
 ) -> list[str]:
-    pool = stored_demonstrations.load(folder)
-    expert = None if pool is None else float(demonstrations.returns(pool).mean())
     wrong = []
     figures.draw(
         folder / "figures",
         run_tables["evaluations"],
         run_tables["episodes"],
         summary,
-        expert,
         threshold,
         wrong.append,
     )

@@ -4,6 +4,7 @@ import polars as pl
 import pytest
 
 from cmedirl_jax.runs import statistics
+from cmedirl_jax.training.methods import METHODS, PAPER_METHODS
 from experiments import figures
 from tests.support.cells import seeds_table
 
@@ -88,13 +89,13 @@ TWO_NUMBERS = {
 @pytest.mark.parametrize(
     ("cells", "names"),
     [
-        (ONE_NUMBER, ["figure3"]),
-        (TWO_NUMBERS, ["figure3", "figure4", "figure5"]),
-        ({("ddpg", 0): NEVER}, ["figure3"]),
+        (ONE_NUMBER, ["figure3", "survival"]),
+        (TWO_NUMBERS, ["figure3", "survival", "figure4", "figure5"]),
+        ({("ddpg", 0): NEVER}, ["figure3", "survival"]),
     ],
 )
 def test_figures_4_and_5_need_several_numbers_of_demonstrations(cells, names, tmp_path):
-    paths = figures.draw(tmp_path / "figures", *run(cells), 94.0, THRESHOLD)
+    paths = figures.draw(tmp_path / "figures", *run(cells), THRESHOLD)
     expected = {f"{name}.{suffix}" for name in names for suffix in ("png", "svg")}
     assert {path.name for path in paths} == expected
     assert {path.name for path in (tmp_path / "figures").iterdir()} == expected
@@ -104,13 +105,13 @@ def test_figures_4_and_5_need_several_numbers_of_demonstrations(cells, names, tm
 
 def test_the_same_tables_give_the_same_bytes(tmp_path):
     tables = run(TWO_NUMBERS)
-    first, second = (figures.draw(tmp_path / name, *tables, 94.0, THRESHOLD) for name in ("a", "b"))
+    first, second = (figures.draw(tmp_path / name, *tables, THRESHOLD) for name in ("a", "b"))
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
 
 
 def test_cells_that_never_converged_can_be_drawn(tmp_path):
     cells = dict.fromkeys(TWO_NUMBERS, NEVER)
-    assert figures.draw(tmp_path / "figures", *run(cells, seeds=1), None, THRESHOLD)
+    assert figures.draw(tmp_path / "figures", *run(cells, seeds=1), THRESHOLD)
 
 
 def test_figure_3_has_the_mean_of_the_seeds_over_steps():
@@ -130,7 +131,7 @@ def test_figure_3_shows_the_largest_number_of_demonstrations_alone(tmp_path, mon
         return plt.figure()
 
     monkeypatch.setattr(figures, "average_return", average_return)
-    figures.draw(tmp_path / "figures", *run(TWO_NUMBERS), None, THRESHOLD)
+    figures.draw(tmp_path / "figures", *run(TWO_NUMBERS), THRESHOLD)
     for table in drawn.values():
         assert set(table["n_demos"]) == {0, 10}
 
@@ -160,8 +161,31 @@ def test_figure_4_leaves_out_what_never_converged():
         np.testing.assert_array_equal(by_label["HS-DDPG"][0].get_ydata(), [0.0, 0.0])
 
 
-def test_more_methods_than_colours_have_lines_of_their_own():
-    methods = [f"method {index}" for index in range(2 * len(figures.COLOURS) + 1)]
-    lines = figures._lines(pl.DataFrame({"method": methods}))
-    assert list(lines) == methods
-    assert len({tuple(line.values()) for line in lines.values()}) == len(methods)
+def test_every_method_has_one_line_in_all_figures_and_no_other_has_it():
+    every = figures._lines(pl.DataFrame({"method": list(METHODS)}))
+    assert len({tuple(line.values()) for line in every.values()}) == len(METHODS)
+    # The paper's four differ in colour, and in grey.
+    for key in ("color", "linestyle"):
+        assert len({every[method][key] for method in PAPER_METHODS}) == 4
+    some = figures._lines(pl.DataFrame({"method": ["gail", "ddpg"]}))
+    assert some == {method: every[method] for method in ("gail", "ddpg")}
+
+
+def test_many_methods_have_a_panel_each():
+    cells = {(method, 0): LATE for method in list(METHODS)[:6]}
+    evaluations, episodes, _ = run(cells)
+    figure = figures.average_return(evaluations, episodes, 94.0, THRESHOLD)
+    titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
+    assert titles == [METHODS[method].label for method, _ in cells]
+    np.testing.assert_allclose(figure.axes[1].lines[1].get_ydata(), np.add(LATE, 1.0))
+
+
+def test_survival_is_the_share_that_has_not_solved_the_task():
+    evaluations, _, _ = run({("ddpg", 0): (0.0, 89.0, 95.0), ("hs-ddpg", 10): NEVER})
+    (axes,) = figures.survival(evaluations, THRESHOLD).axes
+    ddpg, never = axes.lines
+    # Seed i returns i more: the first solves it at step 500, the others at step 250.
+    by_step = dict(zip(ddpg.get_xdata(), ddpg.get_ydata(), strict=True))
+    assert by_step[250.0] == pytest.approx(1 / 3)
+    assert by_step[500.0] == pytest.approx(0.0, abs=1e-12)
+    assert set(never.get_ydata()) == {1.0}
