@@ -9,13 +9,13 @@ import numpy as np
 
 from benchmarks.workload import CAPACITY, Workload
 from cmedirl_jax import envs
-from cmedirl_jax.agents import hot_start
 from cmedirl_jax.agents.hot_start import HotStartHParams
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
 from cmedirl_jax.irl.rewards import RewardNetworkSettings
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells import compiled as compiled_lib
+from cmedirl_jax.runs.cells import pools
 from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.training.methods import METHODS
@@ -52,7 +52,9 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
     )
 
     # Seeds that have ended are spread at random, then moved behind those that run.
-    data = hot_start.data(pool) if METHODS[workload.method].uses_demonstrations else None
+    data = None
+    if METHODS[workload.method].uses_demonstrations:
+        data = pools.of_learners(pool, workload.seeds).data
     slots = Slots(programs.slots, workload.seeds, programs.group, programs.devices)
     state = compiled_lib.begin(programs, slots, jax.random.key(0), data, workload.n_demos)
     running = np.arange(workload.seeds) < round(workload.running * workload.seeds)

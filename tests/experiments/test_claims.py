@@ -3,7 +3,7 @@ import pytest
 from cmedirl_jax.runs.errors import UserError
 from experiments import claims
 from experiments.presets import PRESETS
-from tests.experiments.test_compare import SEEDS, save, write_config
+from tests.support.curves import SEEDS, save, write_config
 
 
 @pytest.fixture

@@ -85,7 +85,7 @@ def test_the_same_configuration_enters_again_and_changes_nothing(preset, tmp_pat
     ("change", "named"),
     [
         ({"seed": 3}, "--seed 0, not 3;"),
-        ({"expert": "all"}, "--expert best, not all;"),
+        ({"expert": "all"}, "--expert each, not all;"),
         ({"max_steps": None, "max_episodes": 5}, "--max-episodes None, not 5;"),
         ({"demos": Path(__file__)}, f"--demos None, not {__file__};"),
         (
