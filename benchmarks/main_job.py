@@ -29,6 +29,7 @@ from rich.table import Table
 from benchmarks import measuring, serving
 from cmedirl_jax.runs.console import compile_cache, ending, phases, screen
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.runs.storage import outputs
 from experiments import run_grid
 
@@ -76,10 +77,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def learning_steps(seeds: pl.DataFrame, *, trains_experts: bool) -> int:
-    """Learning steps that a run took, by its table of seeds, those of the experts among them."""
-    experts = seeds["expert_steps"].max() if trains_experts else 0
-    return int(seeds["env_steps"].sum()) + int(experts or 0)  # pyright: ignore[reportArgumentType]
+def learning_steps(folder: Path, *, trains_experts: bool) -> int:
+    """Learning steps that a run took, by its folder, those of the experts among them."""
+    steps = int(pl.read_parquet(folder / "seeds.parquet")["env_steps"].sum())
+    pool = stored_demonstrations.load(folder) if trains_experts else None
+    return steps + (0 if pool is None else pool.metadata["expert_env_steps"])
 
 
 def run(job: Sequence[str], cache: str, yardstick: str | None) -> dict[str, Any]:
@@ -102,8 +104,7 @@ def run(job: Sequence[str], cache: str, yardstick: str | None) -> dict[str, Any]
         if done.returncode:
             raise UserError(f"--job: the run failed: {done.stderr[-500:]}")
         spent = json.loads(answer.read_text())
-        seeds = pl.read_parquet(out / "seeds.parquet")
-    steps = learning_steps(seeds, trains_experts=run_grid.parse(job).demos is None)
+        steps = learning_steps(out, trains_experts=run_grid.parse(job).demos is None)
     spent["rest"] = seconds - sum(spent.values())
     result = {
         "seconds": seconds,

@@ -32,6 +32,7 @@ from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.console import phases
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import checkpoints
+from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.training.methods import PAPER_METHODS
 from experiments import run_grid
 from tests.support import pools
@@ -364,25 +365,15 @@ def test_a_run_too_short_for_a_checkpoint_says_so(fake_training):
         checkpoint_cost.measure(checkpoint_cost.Options(every=60.0), compiled=None)
 
 
-def test_the_main_jobs_learning_steps_are_those_of_all_its_seeds():
-    def seeds(cells, count, ended=12_000):
-        steps = [ended] * count
-        # A method without demonstrations, those with, and one that does not interact.
-        return pl.DataFrame(
-            {
-                "env_steps": steps * cells + [0] * count,
-                "expert_steps": [0] * count + [16 * 14_000] * count * cells,
-            }
-        )
-
-    whole = 4 * 100 * 12_000 + 16 * 14_000
-    assert main_job.learning_steps(seeds(4, 100), trains_experts=True) == whole
-    fewer = 3 * 7 * 12_000
-    assert main_job.learning_steps(seeds(3, 7), trains_experts=True) == fewer + 16 * 14_000
+def test_the_main_jobs_learning_steps_are_those_of_all_its_seeds_and_experts(tmp_path):
+    pl.DataFrame({"env_steps": [12_000, 900, 0]}).write_parquet(tmp_path / "seeds.parquet")
+    assert main_job.learning_steps(tmp_path, trains_experts=True) == 12_900
+    metadata = {"env": "MountainCarContinuous-v0", "expert_env_steps": 7_000}
+    pool = pools.random_pool([3, 2])._replace(metadata=metadata)
+    stored_demonstrations.save(tmp_path, pool)
+    assert main_job.learning_steps(tmp_path, trains_experts=True) == 19_900
     # A file of demonstrations tells of its experts, who are not trained again.
-    assert main_job.learning_steps(seeds(3, 7), trains_experts=False) == fewer
-    # By episodes, seeds end when they have lived theirs.
-    assert main_job.learning_steps(seeds(3, 7, 900), trains_experts=False) == 3 * 7 * 900
+    assert main_job.learning_steps(tmp_path, trains_experts=False) == 12_900
 
 
 def test_a_yardsticks_last_rate_counts():
@@ -400,10 +391,14 @@ def test_a_yardstick_without_a_rate_is_refused(command):
 CHILD = """
 import json, os, pathlib, sys
 import polars as pl
+from cmedirl_jax.runs.storage import demonstrations
+from tests.support import pools
 assert sys.argv[2:5] == ["--seeds", "3", "--out"] and len(sys.argv) == 6, sys.argv
 pathlib.Path(sys.argv[5]).mkdir()
-seeds = {"env_steps": [12_000] * 12, "expert_steps": [0] * 3 + [16 * 14_000] * 9}
-pl.DataFrame(seeds).write_parquet(pathlib.Path(sys.argv[5]) / "seeds.parquet")
+metadata = {"env": "MountainCarContinuous-v0", "expert_env_steps": 3 * 14_000}
+pool = pools.random_pool([3])._replace(metadata=metadata)
+demonstrations.save(pathlib.Path(sys.argv[5]), pool)
+pl.DataFrame({"env_steps": [12_000] * 12}).write_parquet(pathlib.Path(sys.argv[5]) / "seeds.parquet")
 cache = pathlib.Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
 warm = (cache / "entry").exists()
 (cache / "entry").touch()
@@ -418,7 +413,7 @@ def test_the_main_job_runs_cold_and_warm(monkeypatch, tmp_path, capsys):
     options = ["--rounds", "2", "--job=--seeds 3", "--yardstick", yardstick]
     assert main_job.main([*options, "--json", str(tmp_path / "job.json")]) == 0
     result = json.loads((tmp_path / "job.json").read_text())
-    steps = 4 * 3 * 12_000 + 16 * 14_000
+    steps = 4 * 3 * 12_000 + 3 * 14_000
     for kind, compilation in (("cold", 0.003), ("warm", 0.001)):
         assert len(result["runs"][kind]) == 2
         for run in result["runs"][kind]:
