@@ -72,6 +72,16 @@ def of_folders(folders: Sequence[Path]) -> str:
     Raises:
         UserError: as `pooled.read`, or if the runs' settings differ.
     """
+    runs = of_one_page(folders)
+    return page(runs, verdicts.judge(runs))
+
+
+def of_one_page(folders: Sequence[Path]) -> list[Pooled]:
+    """The runs of these folders, pooled as far as they have one budget.
+
+    Raises:
+        UserError: as `pooled.read`, or if the runs' settings differ.
+    """
     kinds: dict[str, list[Path]] = {}
     first = run_folder.read(folders[0])["config"]
     for folder in folders:
@@ -80,8 +90,7 @@ def of_folders(folders: Sequence[Path]) -> str:
             raise UserError(f"{folder}: its settings are not those of {folders[0]}")
         kind = f"{config['max_steps']} {config['max_episodes']} {config['evaluate_every']}"
         kinds.setdefault(kind, []).append(folder)
-    runs = [pooled.read(alike) for alike in kinds.values()]
-    return page(runs, verdicts.judge(runs))
+    return [pooled.read(alike) for alike in kinds.values()]
 
 
 def page(runs: Sequence[Pooled], claims: Sequence[Claim]) -> str:

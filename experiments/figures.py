@@ -49,6 +49,7 @@ def draw(
     figures = {
         "figure3": lambda: average_return(shown, episodes.filter(largest), expert, threshold),
         "survival": lambda: survival(shown, threshold),
+        "critic": lambda: critic(shown),
         "figure4": lambda: convergence(summary),
         "figure5": lambda: return_after_convergence(summary, expert),
     }
@@ -61,7 +62,7 @@ def draw(
 
 def files(folder: Path, summary: pl.DataFrame) -> dict[str, list[Path]]:
     """The files of each figure that the cells of `summary` allow."""
-    names = ["figure3", "survival"]
+    names = ["figure3", "survival", "critic"]
     if summary.filter(pl.col("n_demos") > 0)["n_demos"].n_unique() > 1:
         names += ["figure4", "figure5"]
     return {name: [folder / f"{name}.png", folder / f"{name}.svg"] for name in names}
@@ -165,6 +166,24 @@ def survival(evaluations: pl.DataFrame, threshold: float) -> Figure:
     axes.set(xlabel="environment steps", ylabel="share of seeds not solved yet", ylim=(-0.02, 1.02))
     _legend(figure, axes)
     figure.suptitle("Kaplan-Meier curves, with pointwise 95% intervals", fontsize=10)
+    return figure
+
+
+def critic(evaluations: pl.DataFrame) -> Figure:
+    """How stable the critic is: its values and its loss over environment steps (section 4.2)."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    by_steps = evaluations.filter(pl.col("protocol") == "steps")
+    for method, line in _lines(evaluations).items():
+        rows = by_steps.filter(pl.col("method") == method)
+        for axes, column in ((left, "q_mean"), (right, "critic_loss")):
+            known = rows.filter(pl.col(column).is_not_null())
+            if known.height:
+                _band(axes, known, "env_step", column, method, line)
+    left.set(xlabel="environment steps", ylabel="Q over the minibatches")
+    right.set(xlabel="environment steps", ylabel="squared temporal-difference error", yscale="log")
+    _legend(figure, left)
+    figure.suptitle("Means over the seeds and their 95% intervals", fontsize=10)
     return figure
 
 

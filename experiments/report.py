@@ -1,4 +1,4 @@
-"""`python -m experiments.report FOLDER`: a run's tables, summary, verdicts and figures."""
+"""`python -m experiments.report FOLDER`: a run's tables, summary, verdicts, figures and page."""
 
 import dataclasses
 import sys
@@ -15,7 +15,7 @@ from cmedirl_jax.runs.console import ending, screen, streams
 from cmedirl_jax.runs.storage import cells, outputs, tables
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.training.methods import METHODS
-from experiments import claims, figures
+from experiments import claims, figures, page, verdicts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Report(NamedTuple):
 
 
 def report(folder: Path, redraw: bool = False) -> Report:
-    """Write the tables, summary, verdicts and figures of the cells that config.json asks for.
+    """Write the tables, summary, verdicts, figures and page of the cells of config.json.
 
     The verdicts wait until every cell is finished.
 
@@ -69,7 +69,8 @@ def report(folder: Path, redraw: bool = False) -> Report:
         UserError: if the folder holds no finished cell of a run, or a damaged one.
         OSError: if a file cannot be written.
     """
-    config = run_folder.read(folder)["config"]
+    written = run_folder.read(folder)
+    config = written["config"]
     run_tables = tables.read(folder, config)
     threshold = envs.make(config["env"]).spec.reward_threshold
     summary = summarise(run_tables, threshold, config["max_episodes"])
@@ -79,14 +80,23 @@ def report(folder: Path, redraw: bool = False) -> Report:
     if not path.is_file() or path.read_bytes() != content:
         for figure in (folder / "figures").glob("*.*"):
             figure.unlink()
-        (folder / "claims.md").unlink(missing_ok=True)
+        for name in ("claims.md", "report.html"):
+            (folder / name).unlink(missing_ok=True)
     outputs.write(path, content)
+    files = figures.files(folder / "figures", summary)
+    wrong = []
+    if redraw or not all(file.exists() for of_figure in files.values() for file in of_figure):
+        wrong = _draw(folder, run_tables, summary, threshold)
+    # Verdicts, of a run that is whole.
+    judged = []
     if config["seeds"] > 1 and summary["seeds"].to_list() == [config["seeds"]] * _asked(config):
-        outputs.write(folder / "claims.md", claims.of_folders([folder]).encode())
-    files = figures.files(folder / "figures", summary).values()
-    if not redraw and all(file.exists() for of_figure in files for file in of_figure):
-        return Report(summary, [])
-    return Report(summary, _draw(folder, run_tables, summary, threshold))
+        runs = claims.of_one_page([folder])
+        judged = verdicts.judge(runs)
+        outputs.write(folder / "claims.md", claims.page(runs, judged).encode())
+    pictures = {name: of_figure[0] for name, of_figure in files.items()}
+    text = page.page(config, summary, judged, pictures, written["versions"])
+    outputs.write(folder / "report.html", text.encode())
+    return Report(summary, wrong)
 
 
 def _asked(config: dict[str, Any]) -> int:

@@ -397,8 +397,9 @@ assert sys.argv[2:5] == ["--seeds", "3", "--out"] and len(sys.argv) == 6, sys.ar
 pathlib.Path(sys.argv[5]).mkdir()
 metadata = {"env": "MountainCarContinuous-v0", "expert_env_steps": 3 * 14_000}
 pool = pools.random_pool([3])._replace(metadata=metadata)
-demonstrations.save(pathlib.Path(sys.argv[5]), pool)
-pl.DataFrame({"env_steps": [12_000] * 12}).write_parquet(pathlib.Path(sys.argv[5]) / "seeds.parquet")
+folder = pathlib.Path(sys.argv[5])
+demonstrations.save(folder, pool)
+pl.DataFrame({"env_steps": [12_000] * 12}).write_parquet(folder / "seeds.parquet")
 cache = pathlib.Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
 warm = (cache / "entry").exists()
 (cache / "entry").touch()

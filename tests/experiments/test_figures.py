@@ -37,6 +37,8 @@ def run(cells, seeds=3):
                 "env_step": env_step,
                 "episode": env_step // 250,
                 "return_mean": value + seed if protocol == "steps" else 1e6,
+                "q_mean": 2.0 * env_step + seed if env_step else None,
+                "critic_loss": 0.5 if env_step else None,
                 "r_d_mean": None,
                 "r_d_std": None,
             }
@@ -89,9 +91,9 @@ TWO_NUMBERS = {
 @pytest.mark.parametrize(
     ("cells", "names"),
     [
-        (ONE_NUMBER, ["figure3", "survival"]),
-        (TWO_NUMBERS, ["figure3", "survival", "figure4", "figure5"]),
-        ({("ddpg", 0): NEVER}, ["figure3", "survival"]),
+        (ONE_NUMBER, ["figure3", "survival", "critic"]),
+        (TWO_NUMBERS, ["figure3", "survival", "critic", "figure4", "figure5"]),
+        ({("ddpg", 0): NEVER}, ["figure3", "survival", "critic"]),
     ],
 )
 def test_figures_4_and_5_need_several_numbers_of_demonstrations(cells, names, tmp_path):
@@ -189,3 +191,12 @@ def test_survival_is_the_share_that_has_not_solved_the_task():
     assert by_step[250.0] == pytest.approx(1 / 3)
     assert by_step[500.0] == pytest.approx(0.0, abs=1e-12)
     assert set(never.get_ydata()) == {1.0}
+
+
+def test_the_critics_values_and_losses_are_means_over_the_seeds():
+    evaluations, _, _ = run({("ddpg", 0): LATE})
+    values, losses = (axes.lines[0] for axes in figures.critic(evaluations).axes)
+    # Before the first update there are none.
+    np.testing.assert_array_equal(values.get_xdata(), STEPS[1:])
+    np.testing.assert_allclose(values.get_ydata(), 2.0 * np.array(STEPS[1:]) + 1.0)
+    np.testing.assert_allclose(losses.get_ydata(), 0.5)

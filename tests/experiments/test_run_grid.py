@@ -378,7 +378,15 @@ SEEDS, STEPS = 8, (0, 250, 500)
 def test_a_run_leaves_what_the_design_lists_and_nothing_unfinished(smoke):
     folder, done = smoke
     assert {path.name for path in folder.iterdir()} == {
-        *("config.json", "summary.csv", "claims.md", "demonstrations", "cells", "figures"),
+        *(
+            "config.json",
+            "summary.csv",
+            "claims.md",
+            "report.html",
+            "demonstrations",
+            "cells",
+            "figures",
+        ),
         ".lock",
         *TABLES,
     }

@@ -22,7 +22,10 @@ PACKAGES = (
     *("chex", "gymnasium", "numpy", "orbax-checkpoint"),
 )
 FOLDERS = (stored_demonstrations.FOLDER, checkpoints.FOLDER, cells.FOLDER, "figures")
-FILES = ("config.json", "summary.csv", "claims.md", *(f"{name}.parquet" for name in cells.TABLES))
+FILES = (
+    *("config.json", "summary.csv", "claims.md", "report.html"),
+    *(f"{name}.parquet" for name in cells.TABLES),
+)
 CELLS_ASKED = ("methods", "n_demos", "seeds")
 """The options that say which cells there are. The same folder may be given others."""
 _LOCK = ".lock"

@@ -1,0 +1,178 @@
+"""The report of a run as one HTML page that needs no other file: `report.html` in its folder."""
+
+import base64
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from cmedirl_jax.training.methods import METHODS
+from experiments.evidence import said
+from experiments.verdicts import Claim
+
+CAPTIONS = {
+    "figure3": "Figure 3: average return during training.",
+    "survival": "How many seeds have not solved the task yet.",
+    "critic": "The stability of the Q network, the paper's second criterion.",
+    "figure4": "Figure 4: episodes and environment steps until convergence, over the number of "
+    "demonstrations.",
+    "figure5": "Figure 5: average return after convergence, over the number of demonstrations.",
+}
+"""What is written below each figure, in the page's order."""
+
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 0 auto; max-width: 60rem;
+  padding: 1rem; }
+h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.5rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: 0.9rem; }
+th, td { border-bottom: 1px solid #ddd; padding: 0.3rem 0.6rem; text-align: left;
+  vertical-align: top; }
+td.number { text-align: right; white-space: nowrap; }
+small { color: #555; display: block; }
+figure { margin: 2rem 0; } figure img { max-width: 100%; height: auto; }
+figcaption { color: #555; font-size: 0.9rem; }
+details { margin: 0.3rem 0; } pre { overflow-x: auto; font-size: 0.8rem; }
+.supported { color: #006b4d; } .not { color: #a03000; } .other { color: #555; }
+"""
+
+_COLUMNS = (
+    ("converged_fraction", "solved", "{:.2f}"),
+    ("convergence_env_step_median", "steps to solve, median", "{:,.0f}"),
+    ("sustained_fraction", "stayed solved", "{:.2f}"),
+    ("failed_fraction", "failed at the end", "{:.2f}"),
+    ("area", "mean of all evaluations", "{:.1f}"),
+    ("iqm", "last return, IQM", "{:.2f}"),
+)
+"""Columns of summary.csv with intervals, as the page shows them."""
+
+
+def page(
+    config: Mapping[str, Any],
+    summary: pl.DataFrame,
+    claims: Sequence[Claim],
+    figures: Mapping[str, Path],
+    versions: Mapping[str, str],
+) -> str:
+    """The page.
+
+    Args:
+        config: the run's configuration.
+        summary: a row for each cell.
+        claims: the verdicts; empty where there are none.
+        figures: PNG files by their names in `CAPTIONS`; those that are gone are left out.
+        versions: of the packages that made the run.
+    """
+    title = f"{config['env']}, {config['preset']}"
+    budget = f"{config['max_steps']:,} environment steps" if config["max_steps"] else ""
+    if config["max_episodes"]:
+        budget = f"{config['max_episodes']} episodes"
+    parts = [
+        f"<h1>{_text(title)}</h1>",
+        f"<p>{config['seeds']} seeds of each row, {budget} each; study seed {config['seed']}; "
+        f"demonstrators: {_text(config['expert'])}. Brackets are 95% intervals.</p>",
+        _verdicts(claims),
+        "<h2>Results</h2>",
+        _results(summary),
+        *(_figure(name, figures[name]) for name in CAPTIONS if name in figures),
+        _made(config, versions),
+    ]
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{_text(title)}</title><style>{_STYLE}</style></head><body>\n"
+        + "\n".join(part for part in parts if part)
+        + "\n</body></html>\n"
+    )
+
+
+def _text(value: object) -> str:
+    return html.escape(str(value))
+
+
+def _verdicts(claims: Sequence[Claim]) -> str:
+    if not claims:
+        return ""
+    rows = []
+    for claim in claims:
+        kind = {"supported": "supported", "not supported": "not"}.get(claim.verdict, "other")
+        measured = [f"{part.outcome}: {part.measured}" for part in claim.parts] or [claim.why]
+        items = "".join(f"<li>{_text(line)}</li>" for line in measured)
+        rows.append(
+            f"<tr><td>{claim.name}</td><td>{_text(claim.text)}<details><summary>what was measured"
+            f'</summary><ul>{items}</ul></details></td><td class="{kind}"><b>'
+            f"{_text(claim.verdict)}</b></td></tr>"
+        )
+    return (
+        "<h2>The paper's claims</h2><table><tr><th></th><th>claim</th><th>verdict</th></tr>"
+        f"{''.join(rows)}</table>"
+    )
+
+
+def _results(summary: pl.DataFrame) -> str:
+    heads = [
+        "method",
+        *(label for _, label, _ in _COLUMNS),
+        "best policy, its evaluation",
+        "the same, fresh starts",
+        "its expert",
+    ]
+    rows = ["<tr>" + "".join(f"<th>{_text(head)}</th>" for head in heads) + "</tr>"]
+    for row in summary.iter_rows(named=True):
+        label = METHODS[row["method"]].label if row["method"] in METHODS else None
+        name = said((row["method"], row["n_demos"]))
+        cells = [
+            f"<td>{_text(name)}" + (f"<small>{_text(label)}</small>" if label else "") + "</td>"
+        ]
+        cells += [_interval(row, column, form) for column, _, form in _COLUMNS]
+        cells += [
+            f'<td class="number">{_number(row[column], "{:.2f}")}</td>'
+            for column in ("best_evaluation_mean", "best_return_mean", "expert_return_mean")
+        ]
+        rows.append(f"<tr>{''.join(cells)}</tr>")
+    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
+
+
+def _interval(row: Mapping[str, Any], column: str, form: str) -> str:
+    value, low, high = (row[column + end] for end in ("", "_low", "_high"))
+    if value is None:
+        return '<td class="number">-</td>'
+    bounds = f"[{_number(low, form)}, {_number(high, form)}]"
+    return f'<td class="number">{_number(value, form)}<small>{bounds}</small></td>'
+
+
+def _number(value: float | None, form: str) -> str:
+    return "?" if value is None else form.format(value)
+
+
+def _figure(name: str, path: Path) -> str:
+    if not path.is_file():
+        return ""
+    data = base64.b64encode(path.read_bytes()).decode()
+    caption = _text(CAPTIONS[name])
+    return (
+        f'<figure><img src="data:image/png;base64,{data}" alt="{caption}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _made(config: Mapping[str, Any], versions: Mapping[str, str]) -> str:
+    made = ", ".join(f"{name} {version}" for name, version in versions.items())
+    lines = "\n".join(f"{name}: {value}" for name, value in _flat(config))
+    return (
+        f"<h2>What was run</h2><p>{_text(made)}</p><details><summary>every setting</summary>"
+        f"<pre>{_text(lines)}</pre></details>"
+    )
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """The settings by their options' names; where the results lie is no setting."""
+    flat: list[tuple[str, Any]] = []
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            flat += _flat(value, "" if name == "settings" else f"{prefix}{name}.")
+        elif name != "out":
+            flat.append((prefix + name, value))
+    return flat

@@ -1,0 +1,93 @@
+import html.parser
+
+import polars as pl
+import pytest
+
+from cmedirl_jax.runs import statistics, validation
+from experiments import page
+from experiments.presets import PRESETS
+from experiments.verdicts import Claim, Part
+from tests.support.cells import seeds_table
+
+CONFIG = validation.describe(PRESETS["smoke"])
+CLAIMS = [
+    Claim("C1", "Methods & more", (Part("a < b", "yes"),)),
+    Claim("C2", "Others", (Part("c", "no"),)),
+    Claim("C10", "Proofs", (), "none is given"),
+]
+
+
+@pytest.fixture(scope="module")
+def summary():
+    evaluations = pl.DataFrame(
+        [
+            {"method": "hs-ddpg", "n_demos": 5, "protocol": "steps", "seed": seed}
+            | {
+                "env_step": step,
+                "episode": 1,
+                "return_mean": 95.0,
+                "r_d_mean": None,
+                "r_d_std": None,
+            }
+            for seed in range(3)
+            for step in (0, 250)
+        ]
+    )
+    return pl.DataFrame([statistics.summarise(evaluations, seeds_table(3), 90.0, None)])
+
+
+class Reader(html.parser.HTMLParser):
+    """Notes tags that are not closed, and what is shown."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.shown, self.loaded = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+        self.loaded += [value for name, value in attrs if name in ("src", "href")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.shown.append(data)
+
+
+def read(text):
+    reader = Reader()
+    reader.feed(text)
+    assert reader.open == []
+    return reader
+
+
+def test_the_page_shows_verdicts_results_and_figures(summary, tmp_path):
+    picture = tmp_path / "figure3.png"
+    picture.write_bytes(b"abc")
+    text = page.page(CONFIG, summary, CLAIMS, {"figure3": picture}, {"jax": "1.2"})
+    reader = read(text)
+    shown = " ".join(reader.shown)
+    for line in ("Methods & more", "yes: a < b", "not supported", "none is given", "jax 1.2"):
+        assert line in shown
+    assert "hs-ddpg (N_T 5)" in shown
+    assert "[0.29, 1.00]" in shown
+    assert reader.loaded == ["data:image/png;base64,YWJj"]
+
+
+def test_the_page_loads_nothing_and_runs_nothing(summary, tmp_path):
+    text = page.page(CONFIG, summary, CLAIMS, {}, {})
+    assert "<script" not in text
+    assert "http" not in text
+
+
+def test_without_verdicts_or_figures_there_is_still_a_page(summary, tmp_path):
+    gone = {"figure3": tmp_path / "gone.png"}
+    reader = read(page.page(CONFIG, summary, [], gone, {}))
+    assert reader.loaded == []
+    assert not any("claims" in line for line in reader.shown)
+
+
+def test_the_page_does_not_say_where_the_run_lies(summary):
+    config = CONFIG | {"out": "/somewhere/else"}
+    assert "/somewhere" not in page.page(config, summary, [], {}, {})
