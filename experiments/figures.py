@@ -120,7 +120,7 @@ def _panels(evaluations: pl.DataFrame, expert: float | None, threshold: float) -
     columns = 4
     rows = -(-len(lines) // columns)
     figure = Figure(figsize=(11, 2.4 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
+    panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
     by_steps = evaluations.filter(pl.col("protocol") == "steps")
     first = next(iter(lines))
     for method, axes in zip(lines, panels, strict=False):
@@ -132,7 +132,7 @@ def _panels(evaluations: pl.DataFrame, expert: float | None, threshold: float) -
         _band(axes, one, "env_step", "return_mean", method, lines[method] | {"linestyle": "-"})
         _levels(axes, expert, threshold)
         axes.set_title(METHODS[method].label or method, fontsize=10)
-    for axes in list(panels)[len(lines) :]:
+    for axes in panels[len(lines) :]:
         axes.set_axis_off()
     figure.supxlabel("environment steps", fontsize=10)
     figure.supylabel("average return without noise", fontsize=10)

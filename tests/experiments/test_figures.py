@@ -179,6 +179,7 @@ def test_many_methods_have_a_panel_each():
     figure = figures.average_return(evaluations, episodes, 94.0, THRESHOLD)
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert titles == [METHODS[method].label for method, _ in cells]
+    assert [axes.axison for axes in figure.axes] == [True] * 6 + [False] * 2
     np.testing.assert_allclose(figure.axes[1].lines[1].get_ydata(), np.add(LATE, 1.0))
 
 
