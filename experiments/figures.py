@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from cmedirl_jax.runs import drawing, intervals
+from cmedirl_jax.runs import drawing, intervals, statistics
 from cmedirl_jax.runs.console import streams
 from cmedirl_jax.runs.drawing import Axes, Figure
 from cmedirl_jax.training.methods import METHODS
@@ -24,6 +24,7 @@ def draw(
     folder: Path,
     evaluations: pl.DataFrame,
     episodes: pl.DataFrame,
+    seeds: pl.DataFrame,
     summary: pl.DataFrame,
     threshold: float,
     say: Callable[[str], None] = streams.complain,
@@ -34,6 +35,7 @@ def draw(
         folder: made if it is missing.
         evaluations: the run's table.
         episodes: the run's table.
+        seeds: the run's table.
         summary: a row for each cell.
         threshold: return that counts as solved.
         say: called with a line for each figure that cannot be drawn; the others are drawn.
@@ -50,6 +52,7 @@ def draw(
         "figure3": lambda: average_return(shown, episodes.filter(largest), expert, threshold),
         "survival": lambda: survival(shown, threshold),
         "critic": lambda: critic(shown),
+        "cost": lambda: cost(shown, seeds.filter(largest), threshold),
         "figure4": lambda: convergence(summary),
         "figure5": lambda: return_after_convergence(summary, expert),
     }
@@ -62,7 +65,7 @@ def draw(
 
 def files(folder: Path, summary: pl.DataFrame) -> dict[str, list[Path]]:
     """The files of each figure that the cells of `summary` allow."""
-    names = ["figure3", "survival", "critic"]
+    names = ["figure3", "survival", "critic", "cost"]
     if summary.filter(pl.col("n_demos") > 0)["n_demos"].n_unique() > 1:
         names += ["figure4", "figure5"]
     return {name: [folder / f"{name}.png", folder / f"{name}.svg"] for name in names}
@@ -184,6 +187,31 @@ def critic(evaluations: pl.DataFrame) -> Figure:
     right.set(xlabel="environment steps", ylabel="squared temporal-difference error", yscale="log")
     _legend(figure, left)
     figure.suptitle("Means over the seeds and their 95% intervals", fontsize=10)
+    return figure
+
+
+def cost(evaluations: pl.DataFrame, seeds: pl.DataFrame, threshold: float) -> Figure:
+    """Noise-free return over all environment steps: those of experts and demonstrations too."""
+    figure = Figure(figsize=(6.5, 4), layout="constrained")
+    axes = figure.subplots()
+    by_steps = evaluations.filter(pl.col("protocol") == "steps")
+    for method, line in _lines(evaluations).items():
+        rows = by_steps.filter(pl.col("method") == method)
+        before = statistics.steps_before(seeds.filter(pl.col("method") == method)).mean()
+        total = rows.with_columns(env_step=pl.col("env_step") + before)
+        if rows["env_step"].max() == 0:
+            mean, at = intervals.mean(rows["return_mean"].to_numpy()).estimate, before
+            axes.plot([at], [mean], "o", color=line["color"], label=METHODS[method].label or method)
+            continue
+        _band(axes, total, "env_step", "return_mean", method, line)
+    _levels(axes, None, threshold)
+    axes.set(
+        xlabel="environment steps of learner, demonstrations and expert",
+        ylabel="average return",
+        xlim=(0, None),
+    )
+    _legend(figure, axes)
+    figure.suptitle("What it costs in all; means over the seeds and 95% intervals", fontsize=10)
     return figure
 
 

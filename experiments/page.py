@@ -16,6 +16,7 @@ CAPTIONS = {
     "figure3": "Figure 3: average return during training.",
     "survival": "How many seeds have not solved the task yet.",
     "critic": "The stability of the Q network, the paper's second criterion.",
+    "cost": "Return over all environment steps, those of experts and demonstrations included.",
     "figure4": "Figure 4: episodes and environment steps until convergence, over the number of "
     "demonstrations.",
     "figure5": "Figure 5: average return after convergence, over the number of demonstrations.",

@@ -138,6 +138,7 @@ def _draw(
         folder / "figures",
         run_tables["evaluations"],
         run_tables["episodes"],
+        run_tables["seeds"],
         summary,
         threshold,
         wrong.append,

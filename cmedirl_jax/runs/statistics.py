@@ -140,6 +140,13 @@ def summarise(
         **_returns(statistics, evaluations, interacts, clusters),
         **_best(seeds, clusters),
         **_rewards(evaluations),
+        **_interval(
+            "total_steps_to_solve_median",
+            lambda: _from_zero(
+                intervals.median(statistics.convergence_env_step + steps_before(seeds))
+            ),
+            interacts,
+        ),
         **_costs(seeds),
     }
 
@@ -255,6 +262,13 @@ def _rewards(evaluations: pl.DataFrame) -> dict[str, Any]:
         .agg(pl.col("r_d_mean", "r_d_std").last())
     )
     return {"r_d_mean": last["r_d_mean"].mean(), "r_d_std": last["r_d_std"].mean()}
+
+
+def steps_before(seeds: pl.DataFrame) -> np.ndarray:
+    """`[seeds]`, environment steps that each seed's demonstrations took, its experts' included."""
+    return (
+        seeds.select(pl.col("expert_steps") + pl.col("demonstration_steps")).to_series().to_numpy()
+    )
 
 
 def _costs(seeds: pl.DataFrame) -> dict[str, Any]:

@@ -63,6 +63,10 @@ def run(cells, seeds=3):
         ]
     )
     per_seed = seeds_table(seeds)
+    every_seed = pl.concat(
+        per_seed.with_columns(method=pl.lit(method), n_demos=pl.lit(n_demos))
+        for method, n_demos in cells
+    )
     summary = pl.DataFrame(
         [
             statistics.summarise(
@@ -75,7 +79,7 @@ def run(cells, seeds=3):
         ],
         infer_schema_length=None,
     )
-    return evaluations, episodes, summary
+    return evaluations, episodes, every_seed, summary
 
 
 ONE_NUMBER = {("ddpg", 0): NEVER, ("hs-ddpg", 10): AT_ONCE}
@@ -91,9 +95,9 @@ TWO_NUMBERS = {
 @pytest.mark.parametrize(
     ("cells", "names"),
     [
-        (ONE_NUMBER, ["figure3", "survival", "critic"]),
-        (TWO_NUMBERS, ["figure3", "survival", "critic", "figure4", "figure5"]),
-        ({("ddpg", 0): NEVER}, ["figure3", "survival", "critic"]),
+        (ONE_NUMBER, ["figure3", "survival", "critic", "cost"]),
+        (TWO_NUMBERS, ["figure3", "survival", "critic", "cost", "figure4", "figure5"]),
+        ({("ddpg", 0): NEVER}, ["figure3", "survival", "critic", "cost"]),
     ],
 )
 def test_figures_4_and_5_need_several_numbers_of_demonstrations(cells, names, tmp_path):
@@ -117,7 +121,7 @@ def test_cells_that_never_converged_can_be_drawn(tmp_path):
 
 
 def test_figure_3_has_the_mean_of_the_seeds_over_steps():
-    evaluations, episodes, _ = run({("ddpg", 0): LATE})
+    evaluations, episodes, _, _ = run({("ddpg", 0): LATE})
     left, _ = figures.average_return(evaluations, episodes, None, THRESHOLD).axes
     curve = left.lines[0]
     assert curve.get_label() == "DDPG"
@@ -139,7 +143,7 @@ def test_figure_3_shows_the_largest_number_of_demonstrations_alone(tmp_path, mon
 
 
 def test_a_curve_over_episodes_stops_where_the_first_seed_runs_out():
-    evaluations, episodes, _ = run({("ddpg", 0): LATE})
+    evaluations, episodes, _, _ = run({("ddpg", 0): LATE})
     _, right = figures.average_return(evaluations, episodes, None, THRESHOLD).axes
     curve = right.lines[0]
     np.testing.assert_array_equal(curve.get_xdata(), [1, 2])
@@ -147,14 +151,14 @@ def test_a_curve_over_episodes_stops_where_the_first_seed_runs_out():
 
 
 def test_a_method_with_a_seed_that_finished_no_episode_has_no_curve_over_episodes():
-    evaluations, episodes, _ = run({("ddpg", 0): LATE})
+    evaluations, episodes, _, _ = run({("ddpg", 0): LATE})
     episodes = episodes.filter(pl.col("seed") > 0)
     _, right = figures.average_return(evaluations, episodes, None, THRESHOLD).axes
     assert [line.get_label() for line in right.lines] == ["solved"]
 
 
 def test_figure_4_leaves_out_what_never_converged():
-    _, _, summary = run(TWO_NUMBERS)
+    _, _, _, summary = run(TWO_NUMBERS)
     left, right = figures.convergence(summary).axes
     for axes, median in ((left, 2.0), (right, 500.0)):
         by_label = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
@@ -175,7 +179,7 @@ def test_every_method_has_one_line_in_all_figures_and_no_other_has_it():
 
 def test_many_methods_have_a_panel_each():
     cells = {(method, 0): LATE for method in list(METHODS)[:6]}
-    evaluations, episodes, _ = run(cells)
+    evaluations, episodes, _, _ = run(cells)
     figure = figures.average_return(evaluations, episodes, 94.0, THRESHOLD)
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert titles == [METHODS[method].label for method, _ in cells]
@@ -184,7 +188,7 @@ def test_many_methods_have_a_panel_each():
 
 
 def test_survival_is_the_share_that_has_not_solved_the_task():
-    evaluations, _, _ = run({("ddpg", 0): (0.0, 89.0, 95.0), ("hs-ddpg", 10): NEVER})
+    evaluations, _, _, _ = run({("ddpg", 0): (0.0, 89.0, 95.0), ("hs-ddpg", 10): NEVER})
     (axes,) = figures.survival(evaluations, THRESHOLD).axes
     ddpg, never = axes.lines
     # Seed i returns i more: the first solves it at step 500, the others at step 250.
@@ -195,9 +199,20 @@ def test_survival_is_the_share_that_has_not_solved_the_task():
 
 
 def test_the_critics_values_and_losses_are_means_over_the_seeds():
-    evaluations, _, _ = run({("ddpg", 0): LATE})
+    evaluations, _, _, _ = run({("ddpg", 0): LATE})
     values, losses = (axes.lines[0] for axes in figures.critic(evaluations).axes)
     # Before the first update there are none.
     np.testing.assert_array_equal(values.get_xdata(), STEPS[1:])
     np.testing.assert_allclose(values.get_ydata(), 2.0 * np.array(STEPS[1:]) + 1.0)
     np.testing.assert_allclose(losses.get_ydata(), 0.5)
+
+
+def test_all_steps_are_those_of_the_expert_and_the_demonstrations_too():
+    evaluations, _, seeds, _ = run({("ddpg", 0): LATE, ("hs-ddpg", 10): AT_ONCE})
+    free = seeds.with_columns(
+        pl.when(pl.col("method") == "ddpg").then(0).otherwise(pl.col(name)).alias(name)
+        for name in ("expert_steps", "demonstration_steps")
+    )
+    ddpg, hot, _ = figures.cost(evaluations, free, THRESHOLD).axes[0].lines
+    np.testing.assert_array_equal(ddpg.get_xdata(), STEPS)
+    np.testing.assert_array_equal(hot.get_xdata(), np.add(STEPS, 4_000 + 90))

@@ -116,6 +116,7 @@ def test_summary_of_a_cell_by_hand():
         "experts": 3,
         "converged_fraction": 1.0,
         "convergence_env_step_median": 250.0,
+        "total_steps_to_solve_median": 250.0 + 4_000 + 90,
         "convergence_episode_median": 2.0,
         "convergence_episode_mean": 2.0,
         "convergence_episode_std": 2.0,
