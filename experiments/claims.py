@@ -11,8 +11,8 @@ would look like in the tables:
 - no better, as stable: the 90% interval of the difference lies within the margin (500 environment
   steps, 1 of return, 0.02 of the share of seeds), or the difference has the other sign.
 
-What neither shows is inconclusive, and so is a difference that has opposite signs, each significant
-by itself, in two study seeds. Study seeds are pooled; seeds that share an expert are resampled
+What neither shows is inconclusive. So is a difference that has opposite signs, each significant by
+itself, in two study seeds, and one to or from a cell most of whose seeds diverged. Study seeds are pooled; seeds that share an expert are resampled
 together. A claim of several parts is supported if all are, not supported if none is, supported in
 part if some are and some are not, and inconclusive otherwise.
 """

@@ -25,6 +25,7 @@ class Comparison(NamedTuple):
         measure: by what.
         found: over all study seeds.
         studies: in each study seed.
+        diverged: the largest share of the seeds of a cell that diverged.
         p_holm: adjusted over the page.
     """
 
@@ -32,6 +33,7 @@ class Comparison(NamedTuple):
     measure: Measure
     found: Difference
     studies: tuple[Difference, ...]
+    diverged: float = 0.0
     p_holm: float = 1.0
 
     @property
@@ -47,7 +49,8 @@ class Comparison(NamedTuple):
 
     def differs(self, sign: Sign) -> Outcome:
         """Whether the cell has less, or more, than the one that it is compared with."""
-        if self.disagree:
+        # A cell most of whose seeds diverged says that something is wrong with it.
+        if self.disagree or self.diverged > 0.5:
             return "unclear"
         if self.p_holm <= LEVEL:
             return "yes" if (self.found.mean.estimate > 0) == (sign == "more") else "no"
@@ -67,7 +70,8 @@ class Comparison(NamedTuple):
         if len(self.studies) > 1:
             each = ", ".join(self.measure.form.format(x.mean.estimate) for x in self.studies)
             text += f"; by study seed {each}"
-        return text + (" (they disagree)" if self.disagree else "")
+        text += " (they disagree)" if self.disagree else ""
+        return text + (f"; up to {self.diverged:.0%} of a cell diverged" if self.diverged else "")
 
 
 class Evidence:
@@ -110,14 +114,10 @@ class Evidence:
             values = measure.of(cell, run.most)[mine]
             against = measure.of(reference, run.most)[others]
             clusters = pooled.clusters(cell, reference, mine, others)
-            return _comparison(
-                f"{said(name)} against {said(other)}",
-                measure,
-                values,
-                against,
-                clusters,
-                cell.study[mine],
-            )
+            label = f"{said(name)} against {said(other)}"
+            found = _comparison(label, measure, values, against, clusters, cell.study[mine])
+            diverged = max(cell.diverged.mean(), reference.diverged.mean())
+            return found._replace(diverged=float(diverged))
 
         return self._remember((f"{name} {other}", measure.name), make)
 
@@ -132,7 +132,8 @@ class Evidence:
             clusters = cell.expert if (cell.expert >= 0).all() else None
             values = measure.of(cell, run.most)
             label = f"{said(name)} against its experts"
-            return _comparison(label, measure, values, cell.expert_return, clusters, cell.study)
+            found = _comparison(label, measure, values, cell.expert_return, clusters, cell.study)
+            return found._replace(diverged=float(cell.diverged.mean()))
 
         return self._remember((str(name), f"expert {measure.name}"), make)
 

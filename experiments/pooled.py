@@ -28,6 +28,7 @@ class CellSeeds(NamedTuple):
     Attributes:
         pair: what a seed is paired by: its study's seed and its own number.
         expert: whose demonstrations it has, -1 for none or several.
+        diverged: bool.
         statistics: of its evaluations by steps.
         expert_return: of its expert on the evaluation starts; NaN if it has none.
         best_evaluation: the highest of its evaluations.
@@ -37,6 +38,7 @@ class CellSeeds(NamedTuple):
 
     pair: np.ndarray
     expert: np.ndarray
+    diverged: np.ndarray
     statistics: SeedStatistics
     expert_return: np.ndarray
     best_evaluation: np.ndarray
@@ -121,6 +123,7 @@ def _cells(folder: Path, config: dict[str, Any], threshold: float) -> dict[CellN
         cells[method, n_demos] = CellSeeds(
             pair=numbers["seed"].to_numpy(),
             expert=numbers["expert_id"].fill_null(-1).to_numpy(),
+            diverged=of_cell["diverged"].to_numpy(),
             statistics=found,
             expert_return=numbers["expert_return"].fill_null(np.nan).to_numpy(),
             best_evaluation=numbers["best_evaluation"].to_numpy(),
@@ -137,6 +140,7 @@ def _joined(parts: list[CellSeeds]) -> CellSeeds:
     return CellSeeds(
         pair=column("pair"),
         expert=column("expert"),
+        diverged=column("diverged"),
         statistics=SeedStatistics(
             *(np.concatenate(leaf) for leaf in zip(*(x.statistics for x in parts), strict=True))
         ),

@@ -240,7 +240,10 @@ def visitation(
     row = jnp.arange(data.transition.reward.shape[0])
     episode = jnp.maximum(jnp.searchsorted(pool.start, row, side="right") - 1, 0)
     time = row - pool.start[episode]
-    weight = jnp.where((time >= 0) & (time < pool.length[episode]), weight[episode], 0.0)
+    inside = (time >= 0) & (time < pool.length[episode])
+    weight = jnp.where(inside, weight[episode], 0.0)
+    # A discount to a large negative power would be infinite.
+    time = jnp.where(inside, time, 0)
     state, state_weight = interpolation.interpolate(mdp.states, data.transition.observation)
     action, action_weight = interpolation.interpolate(mdp.actions, data.transition.action)
     discounts = jnp.asarray(discount**time, weight.dtype)

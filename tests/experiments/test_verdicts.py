@@ -12,7 +12,16 @@ MOST = 50 * EVERY
 
 
 def cell(
-    at=0, *, last=94.0, dips=0, expert=94.0, studies=(0,), episode_steps=100, spread=0.1, jump=None
+    at=0,
+    *,
+    last=94.0,
+    dips=0,
+    expert=94.0,
+    studies=(0,),
+    episode_steps=100,
+    spread=0.1,
+    jump=None,
+    diverged=0,
 ):
     """A cell whose seeds solve the task at step `at` and return about `last` from then on.
 
@@ -24,6 +33,7 @@ def cell(
         studies: the study seeds.
         episode_steps: environment steps of an episode.
         spread: deviation of the last return over the seeds.
+        diverged: how many seeds diverged.
         jump: added to the last return, by study seed.
     """
     pairs, rows, columns = [], [], []
@@ -50,6 +60,7 @@ def cell(
     return CellSeeds(
         pair=numbers,
         expert=np.full(numbers.size, -1) if expert is None else numbers,
+        diverged=np.arange(numbers.size) % 100 < diverged,
         statistics=statistics.SeedStatistics(
             *(np.array(leaf, float) for leaf in zip(*columns, strict=True))
         ),
@@ -181,6 +192,15 @@ def test_c8_and_c9_are_better_than_what_never_acts(claim, other):
         "supported in part"
     )
     assert judged(claim, me_ddpg=good, hs_me_ddpg=good).verdict == "not testable"
+
+
+def test_a_cell_that_diverged_proves_nothing():
+    good, gone = cell(last=95.0), cell(None, diverged=30)
+    claim = judged("C9", me_ddpg=good, hs_me_ddpg=good, maxent_irl=gone)
+    assert claim.verdict == "inconclusive"
+    assert "75% of a cell diverged" in claim.parts[0].measured
+    few = cell(None, diverged=4)
+    assert judged("C9", me_ddpg=good, hs_me_ddpg=good, maxent_irl=few).verdict == "supported"
 
 
 def test_c10_is_not_testable():

@@ -60,6 +60,19 @@ def test_visitation_counts_discounted_steps_where_they_were(data, mdp, chosen):
     assert (visits[-1] == 0).all()
 
 
+@pytest.mark.parametrize("block", [slice(0, 2), slice(5, 7), slice(10, 12)])
+def test_steps_of_episodes_that_are_not_the_learners_count_nothing(data, mdp, block):
+    own = DemonstrationSubset(*(np.asarray(leaf)[block] for leaf in data.episodes))
+    # So many steps lie before and after that a discount to their power is 0 or infinite.
+    assert data.transition.reward.size > 10 * 126
+    mine = imitation.visitation(mdp, data._replace(episodes=own), own, discount=0.5)
+    subset = imitation.visitation(mdp, data, own, discount=0.5)
+    for actual, expected in zip(mine[:2], subset[:2], strict=True):
+        assert np.isfinite(actual).all()
+        np.testing.assert_allclose(actual, expected, rtol=1e-6)
+        assert np.asarray(actual).sum() > 0.9
+
+
 @pytest.mark.parametrize(
     ("start", "length", "message"),
     [
