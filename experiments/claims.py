@@ -12,9 +12,10 @@ would look like in the tables:
   steps, 1 of return, 0.02 of the share of seeds), or the difference has the other sign.
 
 What neither shows is inconclusive. So is a difference that has opposite signs, each significant by
-itself, in two study seeds, and one to or from a cell most of whose seeds diverged. Study seeds are pooled; seeds that share an expert are resampled
-together. A claim of several parts is supported if all are, not supported if none is, supported in
-part if some are and some are not, and inconclusive otherwise.
+itself, in two study seeds, and one to or from a cell most of whose seeds diverged. Study seeds are
+pooled; seeds that share an expert are resampled together. A claim of several parts is supported if
+all are, not supported if none is, supported in part if some are and some are not, and inconclusive
+otherwise.
 """
 
 import dataclasses
