@@ -65,8 +65,10 @@ def discretise(key, batch):
 def table_reward(key, batch):
     states, actions = cm.tabular.imitation.grids(SPEC, SETTINGS.tabular)
     made = cm.tabular.table_reward.make(states, actions)
-    table = jnp.ones((states.size, actions.size), jnp.float32) * batch.reward[0]
-    state = cm.tabular.table_reward.state(table, IRLHParams())
+    rising = jnp.linspace(0.0, 1.0, states.size * actions.size, dtype=jnp.float32)
+    table = rising.reshape(states.size, actions.size) * batch.reward[0]
+    visits = jnp.ones(states.size, jnp.float32)
+    state = cm.tabular.table_reward.state(table, visits, 0.05, IRLHParams())
     return state, made.init(key), made.reward(state, batch.observation, batch.action)
 
 
