@@ -176,6 +176,11 @@ def read(folder: Path, config: dict[str, Any]) -> dict[str, pl.DataFrame]:
     run_tables = of_cells(cells.finished(folder), asked, config["seeds"])
     if not run_tables:
         raise UserError(f"{folder}: holds no finished cell of a run")
+    if missing := {"expert_id", "best_evaluation"} - set(run_tables["seeds"].columns):
+        raise UserError(
+            f"{folder}: an older version wrote its cells, without {', '.join(sorted(missing))}; "
+            "read them with that version, or train them again in another folder"
+        )
     return run_tables
 
 

@@ -148,6 +148,14 @@ def test_the_tables_hold_the_cells_asked_for_in_their_order(folder):
     ]
 
 
+def test_tables_of_an_older_version_are_refused(tmp_path):
+    key = CellKey(0, "best", "me-ddpg", 5, 0, 2)
+    rows = cells_of.rows(key)
+    cells_of.save(tmp_path, key, rows | {"seeds": rows["seeds"].drop("expert_id")})
+    with pytest.raises(UserError, match="older version wrote its cells, without expert_id; read"):
+        asked(tmp_path, ["me-ddpg"], [5], 2)
+
+
 def test_tables_of_no_finished_cell_are_refused(folder):
     with pytest.raises(UserError, match="holds no finished cell of a run"):
         asked(folder, ["hs-ddpg"], [5], 2)
