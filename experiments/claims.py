@@ -10,6 +10,7 @@ would look like in the tables:
   at most 0.05 after Holm's correction over all tests of the page.
 - no better, as stable: the 90% interval of the difference lies within the margin (500 environment
   steps, 1 of return, 0.02 of the share of seeds), or the difference has the other sign.
+  A significant difference comes first: it counts however small it is.
 
 What neither shows is inconclusive. So is a difference that has opposite signs, each significant by
 itself, in two study seeds, and one to or from a cell most of whose seeds diverged. Study seeds are
@@ -89,6 +90,8 @@ def of_one_page(folders: Sequence[Path]) -> list[Pooled]:
         config = run_folder.read(folder)["config"]
         if config.get("settings") != first.get("settings"):
             raise UserError(f"{folder}: its settings are not those of {folders[0]}")
+        if config["seeds"] < 2:
+            raise UserError(f"{folder}: one seed has no interval")
         kind = f"{config['max_steps']} {config['max_episodes']} {config['evaluate_every']}"
         kinds.setdefault(kind, []).append(folder)
     return [pooled.read(alike) for alike in kinds.values()]
@@ -106,7 +109,7 @@ def page(runs: Sequence[Pooled], claims: Sequence[Claim]) -> str:
         cells = ", ".join(f"{method} {n}" if n else method for method, n in run.cells)
         lines.append(
             f"- {run.config['seeds']} seeds x {budget}, study seeds "
-            f"{', '.join(map(str, studies))}, experts: {config['expert']}; {cells}"
+            f"{', '.join(map(str, studies))}, experts: {run.config['expert']}; {cells}"
         )
     lines += ["", "| | claim | verdict |", "| --- | --- | --- |"]
     lines += [f"| {claim.name} | {claim.text} | **{claim.verdict}** |" for claim in claims]

@@ -105,7 +105,7 @@ class Evidence:
     def compare(self, name: CellName, other: CellName, measure: Measure) -> Comparison | None:
         """A cell against another of the same run; None if no run has both."""
         run = self.run_with(name, other)
-        if run is None:
+        if run is None or not pooled.aligned(run.cells[name], run.cells[other])[0].size:
             return None
 
         def make() -> Comparison:

@@ -65,7 +65,7 @@ def p_value(difference: np.ndarray, clusters: np.ndarray | None) -> float:
     if clusters is not None and np.unique(clusters).size > 1:
         _, index = np.unique(clusters, return_inverse=True)
         sums = np.bincount(index, weights=difference)
-    if not sums.any():
+    if sums.size < 2 or not sums.any():
         return 1.0
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(FLIPS, sums.size))
     flipped = np.abs(_studentised(signs * sums))
@@ -84,6 +84,8 @@ def _studentised(sums: np.ndarray) -> np.ndarray:
 def equivalence(difference: Difference, margin: float) -> Equivalence:
     """Whether the mean difference is within `margin` of 0, beyond it, or neither is shown."""
     narrow = difference.narrow
+    if difference.pairs < 2:
+        return "inconclusive"
     if narrow.within(-margin, margin):
         return "equivalent"
     if narrow.low > margin or narrow.high < -margin:

@@ -46,3 +46,10 @@ def test_mistakes_are_refused_in_a_line(arguments, named, capsys):
     error = capsys.readouterr().err
     assert named in error
     assert error.count("\n") == 1
+
+
+def test_one_seed_is_not_judged(tmp_path):
+    write_config(tmp_path, methods=("ddpg",), seeds=1)
+    save(tmp_path, "ddpg", 0, [[0, 20, 95]])
+    with pytest.raises(UserError, match="one seed has no interval"):
+        claims.of_folders([tmp_path])

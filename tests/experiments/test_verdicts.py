@@ -235,3 +235,15 @@ def test_claims_about_episodes_are_read_off_runs_over_episodes():
     for runs in ([steps, episodes], [episodes, steps]):
         (found,) = (claim for claim in verdicts.judge(runs) if claim.name == "C4")
         assert found.verdict == "supported"
+
+
+def test_cells_without_a_common_seed_are_not_compared():
+    runs = Pooled(
+        {("ddpg", 0): cell(studies=(0,)), ("hs-ddpg", 200): cell(studies=(1,))},
+        {},
+        90.0,
+        MOST,
+        False,
+    )
+    (found,) = (claim for claim in verdicts.judge([runs]) if claim.name == "C3")
+    assert found.verdict == "not testable"

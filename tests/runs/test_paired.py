@@ -34,6 +34,12 @@ def test_no_difference_at_all_is_no_evidence():
     assert paired.p_value(np.zeros(10), None) == 1.0
 
 
+def test_one_pair_shows_nothing():
+    found = paired.compare(np.array([5.0]), np.array([1.0]))
+    assert found.p_value == 1.0
+    assert paired.equivalence(found, 10.0) == paired.equivalence(found, 1.0) == "inconclusive"
+
+
 def test_a_difference_in_every_pair_is_evidence():
     assert paired.p_value(np.ones(20), None) < 0.001
     assert paired.p_value(-np.linspace(1, 2, 20), None) < 0.001
