@@ -23,16 +23,15 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import outputs
 from experiments import pooled, verdicts
-from experiments.pooled import Pooled
+from experiments.pooled import Pooled, Run
 from experiments.verdicts import Claim
 
 
@@ -72,29 +71,27 @@ def of_folders(folders: Sequence[Path]) -> str:
     """The page of verdicts.
 
     Raises:
-        UserError: as `pooled.read`, or if the runs' settings differ.
+        UserError: as `pooled.load` and `of_one_page`.
     """
-    runs = of_one_page(folders)
+    runs = of_one_page([pooled.load(folder) for folder in folders])
     return page(runs, verdicts.judge(runs))
 
 
-def of_one_page(folders: Sequence[Path]) -> list[Pooled]:
-    """The runs of these folders, pooled as far as they have one budget.
+def of_one_page(runs: Sequence[Run]) -> list[Pooled]:
+    """The runs, pooled as far as they have one budget.
 
     Raises:
-        UserError: as `pooled.read`, or if the runs' settings differ.
+        UserError: as `pooled.pool`, if the runs' settings differ, or for a single seed.
     """
-    kinds: dict[str, list[Path]] = {}
-    first = run_folder.read(folders[0])["config"]
-    for folder in folders:
-        config = run_folder.read(folder)["config"]
-        if config.get("settings") != first.get("settings"):
-            raise UserError(f"{folder}: its settings are not those of {folders[0]}")
-        if config["seeds"] < 2:
-            raise UserError(f"{folder}: one seed has no interval")
-        kind = f"{config['max_steps']} {config['max_episodes']} {config['evaluate_every']}"
-        kinds.setdefault(kind, []).append(folder)
-    return [pooled.read(alike) for alike in kinds.values()]
+    kinds: dict[tuple[Any, ...], list[Run]] = {}
+    for run in runs:
+        if run.config.get("settings") != runs[0].config.get("settings"):
+            raise UserError(f"{run.folder}: its settings are not those of {runs[0].folder}")
+        if run.config["seeds"] < 2:
+            raise UserError(f"{run.folder}: one seed has no interval")
+        kind = tuple(run.config[name] for name in ("max_steps", "max_episodes", "evaluate_every"))
+        kinds.setdefault(kind, []).append(run)
+    return [pooled.pool(alike) for alike in kinds.values()]
 
 
 def page(runs: Sequence[Pooled], claims: Sequence[Claim]) -> str:

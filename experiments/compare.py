@@ -65,10 +65,10 @@ def compare(folders: Sequence[Path], against: str) -> pl.DataFrame:
     """The paired differences between finished runs' cells, a row for each pair and measure.
 
     Raises:
-        UserError: as `pooled.read`; if the seeds end at different steps; for a single seed; if
-            there is no cell of the method `against`, or none to compare with it.
+        UserError: as `pooled.load` and `pooled.pool`; if the seeds end at different steps; for a
+            single seed; if there is no cell of the method `against`, or none to compare with it.
     """
-    runs = pooled.read(folders)
+    runs = pooled.pool([pooled.load(folder) for folder in folders])
     if runs.by_episodes:
         raise UserError(f"{folders[0]}: a run over episodes, whose seeds end at different steps")
     if runs.config["seeds"] < 2:

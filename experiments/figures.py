@@ -1,8 +1,7 @@
-"""The paper's Figures 3, 4 and 5, drawn from the tables of a run."""
+"""The figures of a run: the paper's 3, 4 and 5, survival, the critic's stability and the cost."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -11,11 +10,8 @@ from cmedirl_jax.runs import drawing, intervals, statistics
 from cmedirl_jax.runs.console import streams
 from cmedirl_jax.runs.drawing import Axes, Figure
 from cmedirl_jax.training.methods import METHODS
+from experiments import curves
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart; wine in place of its yellow,
-# which is faint on white.
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#882255", "#000000")
-STYLES = ("-", "--", "-.", ":")
 MOST_CURVES = 5
 """More than these in one panel cannot be told apart: each method gets a panel of its own."""
 
@@ -82,9 +78,9 @@ def average_return(
         return _panels(evaluations, expert, threshold)
     figure = Figure(figsize=(10, 4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    for method, line in _lines(evaluations).items():
+    for method, line in curves.lines(evaluations).items():
         rows = evaluations.filter((pl.col("method") == method) & (pl.col("protocol") == "steps"))
-        _band(left, rows, "env_step", "return_mean", method, line)
+        curves.band(left, rows, "env_step", "return_mean", method, line)
         rows = episodes.filter(pl.col("method") == method)
         if rows.height:
             # The curve ends where the first seed runs out of episodes: a mean over the seeds that
@@ -92,7 +88,7 @@ def average_return(
             last = rows.group_by("seed").agg(pl.col("episode").max())
             seeds = evaluations.filter(pl.col("method") == method)["seed"].n_unique()
             shortest = last["episode"].min() if last.height == seeds else 0
-            _band(
+            curves.band(
                 right,
                 rows.filter(pl.col("episode") <= shortest),
                 "episode",
@@ -101,14 +97,14 @@ def average_return(
                 line,
             )
     for axes in (left, right):
-        _levels(axes, expert, threshold)
+        curves.levels(axes, expert, threshold)
     left.set(
         title="Evaluation without exploration noise",
         xlabel="environment steps",
         ylabel="average return",
     )
     right.set(title="Training episodes, with exploration noise", xlabel="episodes")
-    _legend(figure, left)
+    curves.legend(figure, left)
     seeds = evaluations["seed"].n_unique()
     n_demos = evaluations["n_demos"].max()
     figure.suptitle(
@@ -119,7 +115,7 @@ def average_return(
 
 def _panels(evaluations: pl.DataFrame, expert: float | None, threshold: float) -> Figure:
     """Noise-free return over environment steps, a panel for each method beside the first one."""
-    lines = _lines(evaluations)
+    lines = curves.lines(evaluations)
     columns = 4
     rows = -(-len(lines) // columns)
     figure = Figure(figsize=(11, 2.4 * rows), layout="constrained")
@@ -130,10 +126,12 @@ def _panels(evaluations: pl.DataFrame, expert: float | None, threshold: float) -
         if method != first:
             grey = {"color": "0.6", "linestyle": "-"}
             reference = by_steps.filter(pl.col("method") == first)
-            _band(axes, reference, "env_step", "return_mean", first, grey)
+            curves.band(axes, reference, "env_step", "return_mean", first, grey)
         one = by_steps.filter(pl.col("method") == method)
-        _band(axes, one, "env_step", "return_mean", method, lines[method] | {"linestyle": "-"})
-        _levels(axes, expert, threshold)
+        curves.band(
+            axes, one, "env_step", "return_mean", method, lines[method] | {"linestyle": "-"}
+        )
+        curves.levels(axes, expert, threshold)
         axes.set_title(METHODS[method].label or method, fontsize=10)
     for axes in panels[len(lines) :]:
         axes.set_axis_off()
@@ -154,7 +152,7 @@ def survival(evaluations: pl.DataFrame, threshold: float) -> Figure:
     figure = Figure(figsize=(6.5, 4), layout="constrained")
     axes = figure.subplots()
     by_steps = evaluations.filter(pl.col("protocol") == "steps")
-    for method, line in _lines(evaluations).items():
+    for method, line in curves.lines(evaluations).items():
         rows = by_steps.filter(pl.col("method") == method)
         if rows["env_step"].max() == 0:
             continue
@@ -167,7 +165,7 @@ def survival(evaluations: pl.DataFrame, threshold: float) -> Figure:
         axes.step(at, share, where="post", **line, label=METHODS[method].label or method)
         axes.fill_between(at, low, high, step="post", color=line["color"], alpha=0.15, linewidth=0)
     axes.set(xlabel="environment steps", ylabel="share of seeds not solved yet", ylim=(-0.02, 1.02))
-    _legend(figure, axes)
+    curves.legend(figure, axes)
     figure.suptitle("Kaplan-Meier curves, with pointwise 95% intervals", fontsize=10)
     return figure
 
@@ -177,15 +175,15 @@ def critic(evaluations: pl.DataFrame) -> Figure:
     figure = Figure(figsize=(10, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     by_steps = evaluations.filter(pl.col("protocol") == "steps")
-    for method, line in _lines(evaluations).items():
+    for method, line in curves.lines(evaluations).items():
         rows = by_steps.filter(pl.col("method") == method)
         for axes, column in ((left, "q_mean"), (right, "critic_loss")):
             known = rows.filter(pl.col(column).is_not_null())
             if known.height:
-                _band(axes, known, "env_step", column, method, line)
+                curves.band(axes, known, "env_step", column, method, line)
     left.set(xlabel="environment steps", ylabel="Q over the minibatches")
     right.set(xlabel="environment steps", ylabel="squared temporal-difference error", yscale="log")
-    _legend(figure, left)
+    curves.legend(figure, left)
     figure.suptitle("Means over the seeds and their 95% intervals", fontsize=10)
     return figure
 
@@ -195,7 +193,7 @@ def cost(evaluations: pl.DataFrame, seeds: pl.DataFrame, threshold: float) -> Fi
     figure = Figure(figsize=(6.5, 4), layout="constrained")
     axes = figure.subplots()
     by_steps = evaluations.filter(pl.col("protocol") == "steps")
-    for method, line in _lines(evaluations).items():
+    for method, line in curves.lines(evaluations).items():
         rows = by_steps.filter(pl.col("method") == method)
         before = statistics.steps_before(seeds.filter(pl.col("method") == method)).mean()
         total = rows.with_columns(env_step=pl.col("env_step") + before)
@@ -203,14 +201,14 @@ def cost(evaluations: pl.DataFrame, seeds: pl.DataFrame, threshold: float) -> Fi
             mean, at = intervals.mean(rows["return_mean"].to_numpy()).estimate, before
             axes.plot([at], [mean], "o", color=line["color"], label=METHODS[method].label or method)
             continue
-        _band(axes, total, "env_step", "return_mean", method, line)
-    _levels(axes, None, threshold)
+        curves.band(axes, total, "env_step", "return_mean", method, line)
+    curves.levels(axes, None, threshold)
     axes.set(
         xlabel="environment steps of learner, demonstrations and expert",
         ylabel="average return",
         xlim=(0, None),
     )
-    _legend(figure, axes)
+    curves.legend(figure, axes)
     figure.suptitle("What it costs in all; means over the seeds and 95% intervals", fontsize=10)
     return figure
 
@@ -223,7 +221,7 @@ def convergence(summary: pl.DataFrame) -> Figure:
     left.set(ylabel="median episodes")
     _over_demonstrations(right, summary, "convergence_env_step_median")
     right.set(ylabel="median environment steps")
-    _legend(figure, left)
+    curves.legend(figure, left)
     figure.suptitle(
         "Until convergence: first evaluation at the reward threshold; 95% intervals", fontsize=10
     )
@@ -235,9 +233,9 @@ def return_after_convergence(summary: pl.DataFrame, expert: float | None) -> Fig
     figure = Figure(figsize=(5.5, 4), layout="constrained")
     axes = figure.subplots()
     _over_demonstrations(axes, summary, "return_after_convergence")
-    _levels(axes, expert, None)
+    curves.levels(axes, expert, None)
     axes.set(ylabel="average return after convergence")
-    _legend(figure, axes)
+    curves.legend(figure, axes)
     figure.suptitle("Mean over the seeds that converged and its 95% interval", fontsize=10)
     return figure
 
@@ -245,7 +243,7 @@ def return_after_convergence(summary: pl.DataFrame, expert: float | None) -> Fig
 def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None:
     numbers = sorted(set(summary.filter(pl.col("n_demos") > 0)["n_demos"]))
     positions = np.arange(len(numbers))
-    lines = _lines(summary)
+    lines = curves.lines(summary)
     for index, (method, line) in enumerate(lines.items()):
         rows = summary.filter(pl.col("method") == method).sort("n_demos")
         low, middle, high = (
@@ -278,49 +276,3 @@ def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None
         )
     axes.set_xticks(positions, [str(number) for number in numbers])
     axes.set_xlabel("demonstrations $N_T$")
-
-
-def _band(
-    axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, line: dict[str, Any]
-) -> None:
-    points = rows.group_by(x, maintain_order=True).agg(pl.col(y)).sort(x)
-    seeds = rows["seed"].n_unique()
-    points = points.filter(pl.col(y).list.len() == seeds)
-    bands = np.array([intervals.mean(values.to_numpy()) for values in points[y]])
-    if not len(bands):
-        return
-    label = METHODS[method].label or method
-    if len(bands) == 1:
-        # A method that never interacts has the same return at every step.
-        axes.axhline(bands[0, 0], color=line["color"], linestyle="-.", label=label)
-        return
-    axes.plot(points[x], bands[:, 0], **line, label=label)
-    axes.fill_between(
-        points[x], bands[:, 1], bands[:, 2], color=line["color"], alpha=0.2, linewidth=0
-    )
-
-
-def _levels(axes: Axes, expert: float | None, threshold: float | None) -> None:
-    """Lines at the experts' return and at the threshold."""
-    if expert is not None:
-        axes.axhline(expert, color="0.4", linestyle="--", linewidth=1, label="experts")
-    if threshold is not None:
-        axes.axhline(threshold, color="0.7", linestyle=":", linewidth=1, label="solved")
-
-
-def _legend(figure: Figure, axes: Axes) -> None:
-    """One legend for the figure, below it, where it hides nothing."""
-    handles, labels = axes.get_legend_handles_labels()
-    columns = min(len(labels), 3 * len(figure.axes))
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
-
-
-def _lines(table: pl.DataFrame) -> dict[str, dict[str, Any]]:
-    """Each method's line: the same colour and style in every figure, told apart in grey too."""
-    order = [*METHODS, *sorted(set(table["method"]) - set(METHODS))]
-    lines = {}
-    for method in table["method"].unique(maintain_order=True):
-        index = order.index(method)
-        style = STYLES[(index + index // len(COLOURS)) % len(STYLES)]
-        lines[method] = {"color": COLOURS[index % len(COLOURS)], "linestyle": style}
-    return lines

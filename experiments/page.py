@@ -8,6 +8,7 @@ from typing import Any
 
 import polars as pl
 
+from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.training.methods import METHODS
 from experiments.evidence import said
 from experiments.verdicts import Claim
@@ -161,19 +162,10 @@ def _figure(name: str, path: Path) -> str:
 
 def _made(config: Mapping[str, Any], versions: Mapping[str, str]) -> str:
     made = ", ".join(f"{name} {version}" for name, version in versions.items())
-    lines = "\n".join(f"{name}: {value}" for name, value in _flat(config))
+    # Where the results lie is no setting.
+    settings = run_folder.flat({**config, "out": None})
+    lines = "\n".join(f"{name}: {value}" for name, value in settings.items() if name != "out")
     return (
         f"<h2>What was run</h2><p>{_text(made)}</p><details><summary>every setting</summary>"
         f"<pre>{_text(lines)}</pre></details>"
     )
-
-
-def _flat(config: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """The settings by their options' names; where the results lie is no setting."""
-    flat: list[tuple[str, Any]] = []
-    for name, value in config.items():
-        if isinstance(value, Mapping):
-            flat += _flat(value, "" if name == "settings" else f"{prefix}{name}.")
-        elif name != "out":
-            flat.append((prefix + name, value))
-    return flat

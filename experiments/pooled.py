@@ -22,6 +22,15 @@ CellName = tuple[str, int]
 _MAY_DIFFER = ("seed", "out", "methods", "n_demos", "grid", "devices", "group", "checkpoint_every")
 
 
+class Run(NamedTuple):
+    """A run on disk: its folder, its configuration, its task's threshold, its tables by name."""
+
+    folder: Path
+    config: dict[str, Any]
+    threshold: float
+    tables: dict[str, pl.DataFrame]
+
+
 class CellSeeds(NamedTuple):
     """A cell's seeds, arrays `[seeds]`.
 
@@ -69,27 +78,38 @@ class Pooled(NamedTuple):
     by_episodes: bool
 
 
-def read(folders: Sequence[Path]) -> Pooled:
-    """Read the runs' cells.
+def load(folder: Path) -> Run:
+    """Read a run.
 
     Raises:
-        UserError: if a folder holds no run or a damaged one, the configurations differ, or two runs
-            hold the same seeds.
+        UserError: if the folder holds no run, or a damaged one.
     """
-    configs = [run_folder.read(folder)["config"] for folder in folders]
+    config = run_folder.read(folder)["config"]
+    with undamaged(folder):
+        threshold = envs.make(config["env"]).spec.reward_threshold
+        return Run(folder, config, threshold, tables.read(folder, config))
+
+
+def pool(runs: Sequence[Run]) -> Pooled:
+    """Pool the cells of runs.
+
+    Raises:
+        UserError: if a run is damaged or not finished, the configurations differ, or two runs hold
+            the same seeds.
+    """
     found: dict[CellName, list[CellSeeds]] = {}
-    for folder, config in zip(folders, configs, strict=True):
-        _check_alike(folders[0], configs[0], folder, config)
-        with undamaged(folder):
-            threshold = envs.make(config["env"]).spec.reward_threshold
-            for name, cell in _cells(folder, config, threshold).items():
+    for run in runs:
+        _check_alike(runs[0], run)
+        with undamaged(run.folder):
+            for name, cell in _cells(run).items():
                 found.setdefault(name, []).append(cell)
     pooled = {name: _joined(parts) for name, parts in found.items()}
     for (method, _), cell in pooled.items():
         if np.unique(cell.pair).size < cell.pair.size:
-            raise UserError(f"{folders[-1]}: holds seeds of {method} that another folder holds too")
-    first = configs[0]
-    with undamaged(folders[0]):
+            last = runs[-1].folder
+            raise UserError(f"{last}: holds seeds of {method} that another folder holds too")
+    first = runs[0].config
+    with undamaged(runs[0].folder):
         spec = envs.make(first["env"]).spec
         episodes, most = first["max_episodes"], first["max_steps"]
         if most is None:
@@ -97,14 +117,16 @@ def read(folders: Sequence[Path]) -> Pooled:
         return Pooled(pooled, first, spec.reward_threshold, int(most), episodes is not None)
 
 
-def _check_alike(one: Path, first: dict[str, Any], other: Path, config: dict[str, Any]) -> None:
-    for name in sorted(first.keys() | config.keys()):
-        if name not in _MAY_DIFFER and first.get(name) != config.get(name):
-            raise UserError(f"{other}: its {name} is not that of {one}; give runs of one kind")
+def _check_alike(first: Run, other: Run) -> None:
+    for name in sorted(first.config.keys() | other.config.keys()):
+        if name not in _MAY_DIFFER and first.config.get(name) != other.config.get(name):
+            raise UserError(
+                f"{other.folder}: its {name} is not that of {first.folder}; give runs of one kind"
+            )
 
 
-def _cells(folder: Path, config: dict[str, Any], threshold: float) -> dict[CellName, CellSeeds]:
-    run_tables = tables.read(folder, config)
+def _cells(run: Run) -> dict[CellName, CellSeeds]:
+    folder, config, threshold, run_tables = run
     by_cell = ["method", "n_demos"]
     seeds = run_tables["seeds"].partition_by(by_cell, as_dict=True)
     study, count = int(config["seed"]), int(config["seeds"])

@@ -16,6 +16,7 @@ from cmedirl_jax.runs.storage import cells, outputs, tables
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.training.methods import METHODS
 from experiments import claims, figures, page, verdicts
+from experiments.pooled import Run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +91,7 @@ def report(folder: Path, redraw: bool = False) -> Report:
     # Verdicts, of a run that is whole.
     judged = []
     if config["seeds"] > 1 and summary["seeds"].to_list() == [config["seeds"]] * _asked(config):
-        runs = claims.of_one_page([folder])
+        runs = claims.of_one_page([Run(folder, config, threshold, run_tables)])
         judged = verdicts.judge(runs)
         outputs.write(folder / "claims.md", claims.page(runs, judged).encode())
     pictures = {name: of_figure[0] for name, of_figure in files.items()}

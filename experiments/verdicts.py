@@ -11,6 +11,7 @@ import polars as pl
 
 from cmedirl_jax.runs import intervals
 from cmedirl_jax.runs.intervals import Interval
+from cmedirl_jax.training.methods import PAPER_METHODS
 from experiments.evidence import Comparison, Evidence, Outcome, Sign, said
 from experiments.measures import DIPS, FINAL, STABLE, STEPS
 from experiments.pooled import CellName, Pooled
@@ -19,7 +20,6 @@ FACTOR = 1.5
 """About n episodes: within this factor."""
 NEAR = 5.0
 """Near the expert: less than this below it."""
-PAPERS = ("ddpg", "hs-ddpg", "me-ddpg", "hs-me-ddpg")
 
 
 class Part(NamedTuple):
@@ -87,7 +87,7 @@ def _no_better(comparison: Comparison | None, better: Sign, what: str) -> Part |
 
 
 def _near_experts(evidence: Evidence) -> Claim:
-    parts = [_near_expert(evidence, evidence.largest(method)) for method in PAPERS]
+    parts = [_near_expert(evidence, evidence.largest(method)) for method in PAPER_METHODS]
     text = "After about 120 episodes all methods are near the expert"
     return _claim("C1", text, parts, "No run has the methods.")
 
@@ -140,7 +140,7 @@ def _shown(interval: Interval, form: str = "{:+.2f}") -> str:
 def _best_of_all(evidence: Evidence) -> Claim:
     best = evidence.largest("hs-me-ddpg")
     parts: list[Part | None] = []
-    for method in PAPERS[:3]:
+    for method in PAPER_METHODS[:3]:
         other = evidence.largest(method)
         stable, dips = (evidence.compare(best, other, by) for by in (STABLE, DIPS))
         parts.append(_differing(evidence.compare(best, other, STEPS), "less"))
@@ -206,7 +206,7 @@ def _improves_with_demonstrations(evidence: Evidence) -> Claim:
 def _exceeds_expert(evidence: Evidence) -> Claim:
     parts = [
         _differing(evidence.above_expert(evidence.largest(method), FINAL), "more")
-        for method in PAPERS[2:]
+        for method in PAPER_METHODS[2:]
     ]
     text = "ME-DDPG and HS-ME-DDPG exceed the expert"
     return _claim("C7", text, parts, "No run says what its experts return.")
@@ -216,7 +216,7 @@ def _better_than(evidence: Evidence, claim: str, text: str, other: str) -> Claim
     reference = evidence.largest(other)
     parts = [
         _differing(evidence.compare(evidence.largest(method), reference, FINAL), "more")
-        for method in PAPERS[2:]
+        for method in PAPER_METHODS[2:]
     ]
     return _claim(claim, text, parts, f"No run has {other} beside the methods.")
 

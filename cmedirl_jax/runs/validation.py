@@ -102,7 +102,7 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool =
     if path is not None:
         demos = cluster.pool_from_writer(lambda: load_demonstrations(path, env, config.check_demos))
         assert demos is not None
-        held = _held(path, demos, config.seeds)
+        held = _held(path, demos)
         if fewer_will_do and held < max(config.n_demos):
             config = dataclasses.replace(config, n_demos=(held,))
         _check_enough(cells.asked(config.methods, config.n_demos), held)
@@ -282,10 +282,10 @@ def load_demonstrations(path: Path, env: Env, check: DemosCheck) -> Demonstratio
     return pool
 
 
-def _held(path: Path, pool: Demonstrations, learners: int) -> int:
+def _held(path: Path, pool: Demonstrations) -> int:
     """How many demonstrations each learner may draw from."""
     try:
-        return pools.of_learners(pool, learners).data.episodes.start.shape[1]
+        return pools.held(pool)
     except ValueError as error:
         raise UserError(f"--demos: {path}: {error}") from error
 

@@ -4,7 +4,7 @@ import polars as pl
 import pytest
 
 from cmedirl_jax.runs import statistics
-from cmedirl_jax.training.methods import METHODS, PAPER_METHODS
+from cmedirl_jax.training.methods import METHODS
 from experiments import figures
 from tests.support.cells import seeds_table
 
@@ -165,16 +165,6 @@ def test_figure_4_leaves_out_what_never_converged():
         np.testing.assert_array_equal(by_label["DDPG"].get_ydata(), [median] * 2)
         np.testing.assert_array_equal(by_label["ME-DDPG"][0].get_ydata(), [np.nan, median])
         np.testing.assert_array_equal(by_label["HS-DDPG"][0].get_ydata(), [0.0, 0.0])
-
-
-def test_every_method_has_one_line_in_all_figures_and_no_other_has_it():
-    every = figures._lines(pl.DataFrame({"method": list(METHODS)}))
-    assert len({tuple(line.values()) for line in every.values()}) == len(METHODS)
-    # The paper's four differ in colour, and in grey.
-    for key in ("color", "linestyle"):
-        assert len({every[method][key] for method in PAPER_METHODS}) == 4
-    some = figures._lines(pl.DataFrame({"method": ["gail", "ddpg"]}))
-    assert some == {method: every[method] for method in ("gail", "ddpg")}
 
 
 def test_many_methods_have_a_panel_each():

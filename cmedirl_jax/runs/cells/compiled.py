@@ -12,6 +12,7 @@ from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.envs import Env
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
+from cmedirl_jax.runs.cells import pools
 from cmedirl_jax.runs.cells.evaluator import Evaluator
 from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.runs.cluster.base import ALONE
@@ -188,26 +189,18 @@ def begin(
     """
     groups = slots.groups(np.ones(slots.seeds, bool))
     keys = seeds.keys(key, first_seed + programs.slots)[first_seed:][slots.seed]
-    episodes = _episodes(data, first_seed + slots.seed)
+    episodes = None if data is None else pools.episodes_of(data, first_seed + slots.seed)
     networks = programs.draw_networks(keys, groups)
     if programs.hot_start is not None:
         networks = programs.hot_start(keys, networks, episodes, groups, data, n_demos)
     return programs.init(keys, networks, episodes, groups, data, n_demos)
 
 
-def _episodes(data: HotStartData | None, learners: np.ndarray) -> DemonstrationSubset | None:
-    """The episodes that each of these learners draws from; the last one's beyond the study's."""
-    if data is None:
-        return None
-    last = data.episodes.start.shape[0] - 1
-    return jax.tree.map(lambda leaf: leaf[np.minimum(learners, last)], data.episodes)
-
-
 def abstract(programs: CompiledMethod, data: HotStartData | None, n_demos: int) -> TrainingState:
     """The shapes and dtypes of what `begin` makes."""
 
     def of_keys(keys: jax.Array) -> TrainingState:
-        episodes = _episodes(data, np.arange(programs.slots))
+        episodes = None if data is None else pools.episodes_of(data, np.arange(programs.slots))
         return programs.init(keys, programs.draw_networks(keys, 1), episodes, 1, data, n_demos)
 
     return jax.eval_shape(of_keys, seeds.keys(jax.random.key(0), programs.slots))

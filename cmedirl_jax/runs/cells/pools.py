@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from cmedirl_jax.agents import hot_start
@@ -50,22 +51,13 @@ def of_learners(
     Raises:
         ValueError: if the metadata of a pool with an expert for each learner does not fit the pool.
     """
+    experts, returns = _experts(pool)
     data = hot_start.data(pool, discount, reward_scale)
     metadata, episodes = pool.metadata, data.episodes
-    experts = _integers(metadata, "experts_demonstrating")
-    returns = np.asarray(metadata.get("expert_returns", [np.nan] * len(experts)), float)
     steps = metadata.get("expert_env_steps", 0)
     if metadata.get("expert") == EACH:
-        trained = metadata.get("experts_trained", 0)
-        if (
-            not experts
-            or episodes.start.size % len(experts)
-            or returns.size != len(experts)
-            or type(trained) is not int
-            or trained <= experts[-1]
-        ):
-            raise ValueError("its metadata do not say whose its episodes are")
-        who = np.searchsorted(experts, np.arange(learners) % trained) % len(experts)
+        numbers = np.arange(learners) % metadata["experts_trained"]
+        who = np.searchsorted(experts, numbers) % len(experts)
         blocks = [leaf.reshape(len(experts), -1)[who] for leaf in episodes]
         expert, expert_return = np.asarray(experts)[who], returns[who]
         # What it takes to get one expert that solves the task.
@@ -82,6 +74,51 @@ def of_learners(
         np.full(learners, steps),
         metadata,
     )
+
+
+def held(pool: Demonstrations) -> int:
+    """How many of the pool's episodes a learner draws from.
+
+    Raises:
+        ValueError: as `of_learners`.
+    """
+    experts, _ = _experts(pool)
+    sharing = len(experts) if pool.metadata.get("expert") == EACH else 1
+    return _size(pool) // sharing
+
+
+def _experts(pool: Demonstrations) -> tuple[list[int], np.ndarray]:
+    """Who demonstrates, as far as the metadata say so, and what each of them returns."""
+    metadata = pool.metadata
+    experts = _integers(metadata, "experts_demonstrating")
+    returns = np.asarray(metadata.get("expert_returns", [np.nan] * len(experts)), float)
+    if metadata.get("expert") != EACH:
+        return experts, returns
+    trained = metadata.get("experts_trained", 0)
+    if (
+        not experts
+        or _size(pool) % len(experts)
+        or returns.size != len(experts)
+        or type(trained) is not int
+        or trained <= experts[-1]
+    ):
+        raise ValueError("its metadata do not say whose its episodes are")
+    return experts, returns
+
+
+def _size(pool: Demonstrations) -> int:
+    return int(pool.episode[-1]) + 1
+
+
+def episodes_of(data: HotStartData, learners: np.ndarray) -> DemonstrationSubset:
+    """The episodes `[n, E]` that these learners `[n]` draw from; the last one's beyond the study's.
+
+    Args:
+        data: with `episodes` `[learners, E]`, as `of_learners` gives them.
+        learners: their numbers.
+    """
+    last = len(data.episodes.start) - 1
+    return jax.tree.map(lambda leaf: leaf[np.minimum(learners, last)], data.episodes)
 
 
 def _integers(metadata: dict[str, Any], name: str) -> list[int]:

@@ -11,6 +11,7 @@ from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
+from cmedirl_jax.runs.cells import pools
 from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.evaluator import Evaluator
 from cmedirl_jax.runs.cells.record import EpisodeRows, EvaluationRows, Means
@@ -141,8 +142,7 @@ def train(
     """
     # A seed takes seconds: the host looks for signals after one seed of each device.
     keys = seeds.keys(key, first_seed + seeds_count + programs.devices)[first_seed:]
-    learners = np.minimum(first_seed + np.arange(len(keys)), len(data.episodes.start) - 1)
-    episodes = jax.tree.map(lambda leaf: leaf[learners], data.episodes)
+    episodes = pools.episodes_of(data, first_seed + np.arange(len(keys)))
     parts: list[Fitted] = []
 
     def fit(first: int) -> Fitted:

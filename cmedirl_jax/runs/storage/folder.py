@@ -226,7 +226,7 @@ def other_versions(folder: Path) -> dict[str, str]:
 
 def identity(config: dict[str, Any]) -> dict[str, Any]:
     """JSON values that a checkpoint shares with a run that continues it."""
-    compared = {name: value for name, value in _flat(config).items() if name not in _NOT_COMPARED}
+    compared = {name: value for name, value in flat(config).items() if name not in _NOT_COMPARED}
     digest = hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()
     return {"config": digest, **versions(), **numerics.current()}
 
@@ -243,7 +243,7 @@ def _compare(folder: Path, config: dict[str, Any]) -> None:
                 f"--out: {folder} holds a run begun with {name}={began[name]!r}, this is "
                 f"{value!r}; choose another folder or the same setting"
             )
-    before, now = _flat(written["config"]), _flat(config)
+    before, now = flat(written["config"]), flat(config)
     for name in sorted(before.keys() | now.keys()):
         if name not in _NOT_COMPARED and before.get(name) != now.get(name):
             raise UserError(
@@ -252,14 +252,15 @@ def _compare(folder: Path, config: dict[str, Any]) -> None:
             )
 
 
-def _flat(nested: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat = {}
+def flat(nested: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A configuration's values by the names of their options."""
+    values = {}
     for name, value in nested.items():
         if isinstance(value, dict):
-            flat |= _flat(value, "" if name == "settings" else f"{prefix}{name}.")
+            values |= flat(value, "" if name == "settings" else f"{prefix}{name}.")
         else:
-            flat[prefix + name] = value
-    return flat
+            values[prefix + name] = value
+    return values
 
 
 def _option(name: str) -> str:

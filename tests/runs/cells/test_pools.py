@@ -54,6 +54,12 @@ def test_otherwise_all_learners_draw_from_the_whole_pool(metadata, expert, score
         np.testing.assert_array_equal(field, np.tile(of_pool, (3, 1)))
 
 
+@pytest.mark.parametrize("metadata", [EACH, {}, {"experts_demonstrating": [7]}])
+def test_as_many_episodes_are_held_for_a_learner_as_it_draws_from(metadata):
+    pool, shared = of_learners(4, **metadata)
+    assert pools_lib.held(pool._replace(metadata=metadata)) == shared.data.episodes.start.shape[1]
+
+
 @pytest.mark.parametrize(
     ("learners", "metadata", "message"),
     [

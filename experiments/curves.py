@@ -1,0 +1,63 @@
+"""How methods are drawn: the same line for each in every figure, bands, levels and legends."""
+
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from cmedirl_jax.runs import intervals
+from cmedirl_jax.runs.drawing import Axes, Figure
+from cmedirl_jax.training.methods import METHODS
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart; wine in place of its yellow,
+# which is faint on white.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#882255", "#000000")
+STYLES = ("-", "--", "-.", ":")
+
+
+def band(axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, line: dict[str, Any]) -> None:
+    """The mean of column `y` over the seeds with its 95% interval, over column `x`.
+
+    It ends where the first seed has no more rows: a mean over those left would be over other seeds.
+    """
+    points = rows.group_by(x, maintain_order=True).agg(pl.col(y)).sort(x)
+    seeds = rows["seed"].n_unique()
+    points = points.filter(pl.col(y).list.len() == seeds)
+    bands = np.array([intervals.mean(values.to_numpy()) for values in points[y]])
+    if not len(bands):
+        return
+    label = METHODS[method].label or method
+    if len(bands) == 1:
+        # A method that never interacts has the same return at every step.
+        axes.axhline(bands[0, 0], color=line["color"], linestyle="-.", label=label)
+        return
+    axes.plot(points[x], bands[:, 0], **line, label=label)
+    axes.fill_between(
+        points[x], bands[:, 1], bands[:, 2], color=line["color"], alpha=0.2, linewidth=0
+    )
+
+
+def levels(axes: Axes, expert: float | None, threshold: float | None) -> None:
+    """Lines at the experts' return and at the threshold."""
+    if expert is not None:
+        axes.axhline(expert, color="0.4", linestyle="--", linewidth=1, label="experts")
+    if threshold is not None:
+        axes.axhline(threshold, color="0.7", linestyle=":", linewidth=1, label="solved")
+
+
+def legend(figure: Figure, axes: Axes) -> None:
+    """One legend for the figure, below it, where it hides nothing."""
+    handles, labels = axes.get_legend_handles_labels()
+    columns = min(len(labels), 3 * len(figure.axes))
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
+
+
+def lines(table: pl.DataFrame) -> dict[str, dict[str, Any]]:
+    """Each method's line: the same colour and style in every figure, told apart in grey too."""
+    order = [*METHODS, *sorted(set(table["method"]) - set(METHODS))]
+    found = {}
+    for method in table["method"].unique(maintain_order=True):
+        index = order.index(method)
+        style = STYLES[(index + index // len(COLOURS)) % len(STYLES)]
+        found[method] = {"color": COLOURS[index % len(COLOURS)], "linestyle": style}
+    return found
