@@ -9,8 +9,11 @@ would look like in the tables:
 - faster, better, exceeds, more stable: the mean difference of pairs has that sign, and a p-value of
   at most 0.05 after Holm's correction over all tests of the page.
 - no better, as stable: the 90% interval of the difference lies within the margin (500 environment
-  steps, 1 of return, 0.02 of the share of seeds), or the difference has the other sign.
-  A significant difference comes first: it counts however small it is.
+  steps or 5 episodes, 1 of return, 0.02 of the share of seeds), or the difference has the other
+  sign. A significant difference comes first: it counts however small it is.
+
+Speed is counted in environment steps where all seeds live as many of these, and in episodes where
+they live as many episodes.
 
 What neither shows is inconclusive. So is a difference that has opposite signs, each significant by
 itself, in two study seeds, and one to or from a cell most of whose seeds diverged. Study seeds are
@@ -40,7 +43,7 @@ class Options:
     """Which runs.
 
     Attributes:
-        folders: Folders of runs that share their settings; they may differ in the study's seed, the
+        folders: Folders of runs of one configuration; they may differ in the study's seed, the
             cells and the budget. Claims about episodes are read off runs with --max-episodes where
             there are any.
         out: A file for the verdicts; default they are printed.
@@ -81,15 +84,14 @@ def of_one_page(runs: Sequence[Run]) -> list[Pooled]:
     """The runs, pooled as far as they have one budget.
 
     Raises:
-        UserError: as `pooled.pool`, if the runs' settings differ, or for a single seed.
+        UserError: as `pooled.pool`, if more than the budget differs, or for a single seed.
     """
     kinds: dict[tuple[Any, ...], list[Run]] = {}
     for run in runs:
-        if run.config.get("settings") != runs[0].config.get("settings"):
-            raise UserError(f"{run.folder}: its settings are not those of {runs[0].folder}")
+        pooled.check_alike(runs[0], run, but=pooled.BUDGET)
         if run.config["seeds"] < 2:
             raise UserError(f"{run.folder}: one seed has no interval")
-        kind = tuple(run.config[name] for name in ("max_steps", "max_episodes", "evaluate_every"))
+        kind = tuple(run.config.get(name) for name in pooled.BUDGET)
         kinds.setdefault(kind, []).append(run)
     return [pooled.pool(alike) for alike in kinds.values()]
 
@@ -99,9 +101,7 @@ def page(runs: Sequence[Pooled], claims: Sequence[Claim]) -> str:
     config = runs[0].config
     lines = [f"# The paper's claims, under `{config['preset']}`", "", "From these runs:", ""]
     for run in runs:
-        budget = f"{run.most:,} steps"
-        if run.by_episodes:
-            budget = f"{run.config['max_episodes']} episodes"
+        budget = f"{run.steps:,} steps" if run.episodes is None else f"{run.episodes} episodes"
         studies = sorted({int(study) for cell in run.cells.values() for study in cell.study})
         cells = ", ".join(f"{method} {n}" if n else method for method, n in run.cells)
         lines.append(

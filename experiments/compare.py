@@ -7,8 +7,9 @@ by Holm's method.
 """
 
 import dataclasses
+import functools
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,10 +24,9 @@ from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
 from experiments import pooled
-from experiments.measures import AREA, FINAL, STABLE, STEPS, Measure
-from experiments.pooled import CellName, CellSeeds
-
-MEASURES = (STEPS, AREA, FINAL, STABLE)
+from experiments.evidence import said
+from experiments.measures import AREA, EPISODES, FINAL, STABLE, STEPS, Measure, speed
+from experiments.pooled import CellName, CellSeeds, Pooled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,32 +54,48 @@ def main(arguments: Sequence[str] | None = None) -> int:
     outputs.check("out", options.out)
     if not options.folders:
         raise UserError("FOLDERS: give the folder of a run")
-    table = compare(options.folders, options.against)
-    screen.show(screen.console(), shown(table))
+    console = screen.console()
+    table = compare(options.folders, options.against, functools.partial(screen.say, console))
+    screen.show(console, shown(table))
     if options.out is not None:
         outputs.write(options.out, table.write_csv().encode())
     return 0
 
 
-def compare(folders: Sequence[Path], against: str) -> pl.DataFrame:
+def compare(
+    folders: Sequence[Path], against: str, say: Callable[[str], None] = lambda line: None
+) -> pl.DataFrame:
     """The paired differences between finished runs' cells, a row for each pair and measure.
+
+    Args:
+        folders: of the runs.
+        against: a method.
+        say: called with a line on the cells that are left out.
 
     Raises:
         UserError: as `pooled.load` and `pooled.pool`; if the seeds end at different steps; for a
             single seed; if there is no cell of the method `against`, or none to compare with it.
     """
     runs = pooled.pool([pooled.load(folder) for folder in folders])
-    if runs.by_episodes:
-        raise UserError(f"{folders[0]}: a run over episodes, whose seeds end at different steps")
+    if runs.episodes is None and runs.config["max_episodes"] is not None:
+        raise UserError(
+            f"{folders[0]}: its seeds end by --max-steps or by --max-episodes, whichever comes "
+            "first: they are not watched for as long"
+        )
     if runs.config["seeds"] < 2:
         raise UserError(f"{folders[0]}: one seed has no interval")
     rows = []
-    for name, other in _pairs(folders[0], runs.cells, against):
+    pairs = _pairs(folders[0], runs.cells, against)
+    for name, other in pairs:
         cell, reference = runs.cells[name], runs.cells[other]
-        for measure in MEASURES:
+        for measure in (speed(runs), AREA, FINAL, STABLE):
             labels = {"method": name[0], "n_demos": name[1]}
             labels |= {"against": other[0], "against_n_demos": other[1], "measure": measure.name}
-            rows.append(labels | _difference(measure, cell, reference, runs.most))
+            rows.append(labels | _difference(measure, cell, reference, runs))
+    left_out = [name for name in runs.cells if not any(name in pair for pair in pairs)]
+    if left_out:
+        names = ", ".join(said(name) for name in left_out)
+        say(f"Left out, since they never act or {against} has no one cell for them: {names}")
     adjusted = paired.holm(np.array([row["p_value"] for row in rows]))
     return pl.DataFrame([row | {"p_holm": p} for row, p in zip(rows, adjusted, strict=True)])
 
@@ -111,13 +127,14 @@ def _pairs(
 
 
 def _difference(
-    measure: Measure, cell: CellSeeds, reference: CellSeeds, most: int
+    measure: Measure, cell: CellSeeds, reference: CellSeeds, runs: Pooled
 ) -> dict[str, Any]:
     mine, others = pooled.aligned(cell, reference)
     found = paired.compare(
-        measure.of(cell, most)[mine],
-        measure.of(reference, most)[others],
+        measure.of(cell, runs)[mine],
+        measure.of(reference, runs)[others],
         pooled.clusters(cell, reference, mine, others),
+        span=measure.span(runs),
     )
     return {
         "seeds": found.pairs,
@@ -129,26 +146,26 @@ def _difference(
     }
 
 
+_FORMS = {one.name: one.form for one in (STEPS, EPISODES, AREA, FINAL, STABLE)}
+
+
 def shown(table: pl.DataFrame) -> Table:
     """The differences as a table for the screen, a row for each pair of cells."""
     printed = Table(title="mean paired differences; 95% intervals, Holm's p", box=box.SIMPLE)
     printed.add_column("cell")
     printed.add_column("against")
-    for measure in MEASURES:
-        printed.add_column(measure.name.replace("_", " "), justify="right")
+    for name in table["measure"].unique(maintain_order=True):
+        printed.add_column(name.replace("_", " "), justify="right")
     cells = ["method", "n_demos", "against", "against_n_demos"]
-    for (method, n_demos, against, other), group in table.group_by(cells, maintain_order=True):
+    for group in table.partition_by(cells, maintain_order=True):
         row = []
-        for measure, found in zip(MEASURES, group.iter_rows(named=True), strict=True):
-            form = measure.form.format
+        for found in group.iter_rows(named=True):
+            form = _FORMS[found["measure"]].format
             mean, low, high = (form(found[f"difference{end}"]) for end in ("", "_low", "_high"))
             row.append(f"{mean} \\[{low}, {high}]\np {found['p_holm']:.4f}, {found['equivalence']}")
-        printed.add_row(_name(method, n_demos), _name(against, other), *row)
+        method, n_demos, against, other = group.select(cells).row(0)
+        printed.add_row(said((method, n_demos)), said((against, other)), *row)
     return printed
-
-
-def _name(method: Any, n_demos: Any) -> str:
-    return f"{method}, {n_demos}" if n_demos else str(method)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """How methods are drawn: the same line for each in every figure, bands, levels and legends."""
 
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -19,11 +20,19 @@ def band(axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, line: dict
     """The mean of column `y` over the seeds with its 95% interval, over column `x`.
 
     It ends where the first seed has no more rows: a mean over those left would be over other seeds.
+    Seeds that share an expert are resampled together.
     """
-    points = rows.group_by(x, maintain_order=True).agg(pl.col(y)).sort(x)
+    points = rows.group_by(x, maintain_order=True).agg(pl.col(y, "expert_id")).sort(x)
     seeds = rows["seed"].n_unique()
     points = points.filter(pl.col(y).list.len() == seeds)
-    bands = np.array([intervals.mean(values.to_numpy()) for values in points[y]])
+    bands = np.array(
+        [
+            intervals.mean(
+                values.to_numpy(), clusters=None if experts.null_count() else experts.to_numpy()
+            )
+            for values, experts in zip(points[y], points["expert_id"], strict=True)
+        ]
+    )
     if not len(bands):
         return
     label = METHODS[method].label or method
@@ -52,11 +61,35 @@ def legend(figure: Figure, axes: Axes) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
 
 
-def lines(table: pl.DataFrame) -> dict[str, dict[str, Any]]:
+class Over(NamedTuple):
+    """What evaluations are drawn over.
+
+    Attributes:
+        rows: of evaluations.parquet.
+        column: of the horizontal axis.
+        label: of it.
+    """
+
+    rows: pl.DataFrame
+    column: str
+    label: str
+
+
+def over(evaluations: pl.DataFrame, by_episodes: bool) -> Over:
+    """Evaluations over the unit in which all seeds live as long: steps, or episodes."""
+    of_episodes = evaluations.filter(pl.col("protocol") == "episodes")
+    if by_episodes and of_episodes.height:
+        return Over(of_episodes, "episode", "episodes")
+    by_steps = evaluations.filter(pl.col("protocol") == "steps")
+    return Over(by_steps, "env_step", "environment steps")
+
+
+def lines(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Each method's line: the same colour and style in every figure, told apart in grey too."""
-    order = [*METHODS, *sorted(set(table["method"]) - set(METHODS))]
+    methods = list(dict.fromkeys(methods))
+    order = [*METHODS, *sorted(set(methods) - set(METHODS))]
     found = {}
-    for method in table["method"].unique(maintain_order=True):
+    for method in methods:
         index = order.index(method)
         style = STYLES[(index + index // len(COLOURS)) % len(STYLES)]
         found[method] = {"color": COLOURS[index % len(COLOURS)], "linestyle": style}

@@ -8,7 +8,7 @@ import numpy as np
 from cmedirl_jax.runs import paired
 from cmedirl_jax.runs.paired import Difference
 from experiments import pooled
-from experiments.measures import Measure
+from experiments.measures import STEPS, Measure, speed
 from experiments.pooled import CellName, Pooled
 
 Outcome = Literal["yes", "no", "unclear"]
@@ -89,33 +89,64 @@ class Evidence:
                 self._made[key] = one._replace(p_holm=float(p_value))
 
     def run_with(self, *names: CellName, by_episodes: bool = False) -> Pooled | None:
-        """The run that has all these cells, of the kind that is asked for where there is one."""
+        """The run that has all these cells, of the kind that is asked for where there is one.
+
+        Of several it is the one with the most seeds, then the longest.
+        """
+
+        def preference(run: Pooled) -> tuple[bool, int, int]:
+            seeds = min(run.cells[name].pair.size for name in names)
+            return (run.episodes is None) != by_episodes, seeds, run.steps
+
         having = [run for run in self._runs if all(name in run.cells for name in names)]
-        having.sort(key=lambda run: run.by_episodes != by_episodes)
-        return having[0] if having else None
+        return max(having, key=preference, default=None)
 
     def largest(self, method: str) -> CellName:
         """A method's cell with the most demonstrations."""
         return method, max(self.numbers(method), default=0)
 
+    def matched(self, method: str, other: str) -> tuple[CellName, CellName] | None:
+        """Cells of two methods in one run with the most demonstrations that both have.
+
+        A cell without demonstrations goes with any number. None if no run has both.
+        """
+        pairs = [
+            ((method, n), (other, m))
+            for run in self._runs
+            for name, n in run.cells
+            for other_name, m in run.cells
+            if (name, other_name) == (method, other) and (n == m or 0 in (n, m))
+        ]
+        return max(pairs, key=lambda pair: (pair[0][1], pair[1][1]), default=None)
+
     def numbers(self, method: str) -> list[int]:
         """The numbers of demonstrations with which there is a cell of this method, in order."""
         return sorted({n for run in self._runs for name, n in run.cells if name == method})
 
+    def compare_methods(self, method: str, other: str, measure: Measure) -> Comparison | None:
+        """The `matched` cells of two methods compared; None if there are none."""
+        pair = self.matched(method, other)
+        return None if pair is None else self.compare(*pair, measure)
+
     def compare(self, name: CellName, other: CellName, measure: Measure) -> Comparison | None:
-        """A cell against another of the same run; None if no run has both."""
+        """A cell against another of the same run; None if no run has both.
+
+        `STEPS` are episodes in a run in which every seed lives as many of these.
+        """
         run = self.run_with(name, other)
         if run is None or not pooled.aligned(run.cells[name], run.cells[other])[0].size:
             return None
+        measure = speed(run) if measure is STEPS else measure
 
         def make() -> Comparison:
             cell, reference = run.cells[name], run.cells[other]
             mine, others = pooled.aligned(cell, reference)
-            values = measure.of(cell, run.most)[mine]
-            against = measure.of(reference, run.most)[others]
+            values = measure.of(cell, run)[mine]
+            against = measure.of(reference, run)[others]
             clusters = pooled.clusters(cell, reference, mine, others)
             label = f"{said(name)} against {said(other)}"
-            found = _comparison(label, measure, values, against, clusters, cell.study[mine])
+            study = cell.study[mine]
+            found = _comparison(label, measure, values, against, clusters, study, measure.span(run))
             diverged = max(cell.diverged.mean(), reference.diverged.mean())
             return found._replace(diverged=float(diverged))
 
@@ -130,9 +161,11 @@ class Evidence:
         def make() -> Comparison:
             cell = run.cells[name]
             clusters = cell.expert if (cell.expert >= 0).all() else None
-            values = measure.of(cell, run.most)
+            values = measure.of(cell, run)
             label = f"{said(name)} against its experts"
-            found = _comparison(label, measure, values, cell.expert_return, clusters, cell.study)
+            found = _comparison(
+                label, measure, values, cell.expert_return, clusters, cell.study, measure.span(run)
+            )
             return found._replace(diverged=float(cell.diverged.mean()))
 
         return self._remember((str(name), f"expert {measure.name}"), make)
@@ -150,10 +183,11 @@ def _comparison(
     against: np.ndarray,
     clusters: np.ndarray | None,
     study: np.ndarray,
+    span: float,
 ) -> Comparison:
     def among(chosen: np.ndarray) -> Difference:
         own = None if clusters is None else clusters[chosen]
-        return paired.compare(values[chosen], against[chosen], own)
+        return paired.compare(values[chosen], against[chosen], own, span=span)
 
     studies = tuple(among(study == one) for one in np.unique(study))
     return Comparison(label, measure, among(np.ones(values.size, bool)), studies)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.pooled import CellSeeds
+from experiments.pooled import CellSeeds, Pooled
 
 
 class Measure(NamedTuple):
@@ -13,23 +13,33 @@ class Measure(NamedTuple):
 
     Attributes:
         name: as tables call it.
-        of: `(cell, the last step that a seed can reach) -> [seeds]`.
+        of: `(cell, its runs) -> [seeds]`.
         margin: differences within it are as good as none.
         form: of a printed difference.
+        span: `runs -> ` the largest difference that there can be.
     """
 
     name: str
-    of: Callable[[CellSeeds, int], np.ndarray]
+    of: Callable[[CellSeeds, Pooled], np.ndarray]
     margin: float
     form: str
+    span: Callable[[Pooled], float] = lambda runs: np.inf
 
 
 STEPS = Measure(
     "convergence_env_step",
     # A seed that never converged counts as converged at the last step.
-    lambda cell, most: np.minimum(cell.statistics.convergence_env_step, most),
+    lambda cell, runs: np.minimum(cell.statistics.convergence_env_step, runs.steps),
     500.0,
     "{:+,.0f}",
+    lambda runs: float(runs.steps),
+)
+EPISODES = Measure(
+    "convergence_episode",
+    lambda cell, runs: np.minimum(cell.statistics.convergence_episode, runs.episodes or np.inf),
+    5.0,
+    "{:+.1f}",
+    lambda runs: float(runs.episodes or np.inf),
 )
 AREA = Measure("area", lambda cell, _: cell.statistics.area, 1.0, "{:+.1f}")
 FINAL = Measure("final_return", lambda cell, _: cell.statistics.final_return, 1.0, "{:+.2f}")
@@ -38,11 +48,21 @@ STABLE = Measure(
     lambda cell, _: np.asarray(cell.statistics.sustained, float),
     0.02,
     "{:+.3f}",
+    lambda _: 1.0,
 )
-DIPS = Measure(
-    "dip_fraction",
-    # A seed that never converged lies below the threshold throughout.
-    lambda cell, _: np.nan_to_num(cell.statistics.dip_fraction, nan=1.0),
-    0.02,
-    "{:+.3f}",
-)
+
+
+def _dips(cell: CellSeeds, _: Pooled) -> np.ndarray:
+    found = cell.statistics
+    # A seed that never converged lies below the threshold throughout; one that did so at its last
+    # evaluation has not dipped.
+    without = np.where(np.isfinite(found.convergence_env_step), 0.0, 1.0)
+    return np.where(np.isnan(found.dip_fraction), without, found.dip_fraction)
+
+
+DIPS = Measure("dip_fraction", _dips, 0.02, "{:+.3f}", lambda _: 1.0)
+
+
+def speed(runs: Pooled) -> Measure:
+    """When the seeds converge, in the unit in which all of them live as long."""
+    return STEPS if runs.episodes is None else EPISODES

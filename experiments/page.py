@@ -16,6 +16,7 @@ from experiments.verdicts import Claim
 CAPTIONS = {
     "figure3": "Figure 3: average return during training.",
     "survival": "How many seeds have not solved the task yet.",
+    "profile": "How many seeds return more than each score.",
     "critic": "The stability of the Q network, the paper's second criterion.",
     "cost": "Return over all environment steps, those of experts and demonstrations included.",
     "figure4": "Figure 4: episodes and environment steps until convergence, over the number of "
@@ -32,9 +33,10 @@ h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.5rem; }
 table { border-collapse: collapse; font-size: 0.9rem; }
 th, td { border-bottom: 1px solid #ddd; padding: 0.3rem 0.6rem; text-align: left;
   vertical-align: top; }
-td.number { text-align: right; white-space: nowrap; }
+td.number { text-align: right; } td.number, td.name { white-space: nowrap; }
 small { color: #555; display: block; }
-figure { margin: 2rem 0; } figure img { max-width: 100%; height: auto; }
+figure { margin: 2rem 0; overflow-x: auto; } figure img { height: auto; max-width: 100%; }
+figure img.broad { min-width: 40rem; }
 figcaption { color: #555; font-size: 0.9rem; }
 details { margin: 0.3rem 0; } pre { overflow-x: auto; font-size: 0.8rem; }
 .supported { color: #006b4d; } .not { color: #a03000; } .other { color: #555; }
@@ -126,7 +128,9 @@ def _results(summary: pl.DataFrame) -> str:
         label = METHODS[row["method"]].label if row["method"] in METHODS else None
         name = said((row["method"], row["n_demos"]))
         cells = [
-            f"<td>{_text(name)}" + (f"<small>{_text(label)}</small>" if label else "") + "</td>"
+            f'<td class="name">{_text(name)}'
+            + (f"<small>{_text(label)}</small>" if label else "")
+            + "</td>"
         ]
         cells += [_interval(row, column, form) for column, _, form in _COLUMNS]
         cells += [
@@ -152,10 +156,16 @@ def _number(value: float | None, form: str) -> str:
 def _figure(name: str, path: Path) -> str:
     if not path.is_file():
         return ""
-    data = base64.b64encode(path.read_bytes()).decode()
+    content = path.read_bytes()
+    data = base64.b64encode(content).decode()
     caption = _text(CAPTIONS[name])
+    # A PNG's width stands in its header. Text is as large in every figure, and a broad figure
+    # scrolls on a narrow screen.
+    width = int.from_bytes(content[16:20], "big")
+    broad = ' class="broad"' if width > 1_200 else ""
     return (
-        f'<figure><img src="data:image/png;base64,{data}" alt="{caption}">'
+        f'<figure><img{broad} width="{width * 16 // 25}" src="data:image/png;base64,{data}" '
+        f'alt="{caption}">'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 

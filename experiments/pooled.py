@@ -19,7 +19,12 @@ from cmedirl_jax.runs.storage import tables
 CellName = tuple[str, int]
 """A method and its number of demonstrations, 0 for one without."""
 
-_MAY_DIFFER = ("seed", "out", "methods", "n_demos", "grid", "devices", "group", "checkpoint_every")
+BUDGET = (
+    *("max_steps", "max_episodes"),
+    *("evaluate_every", "evaluate_every_episodes", "evaluation_starts_episodes"),
+)
+"""The options that say how long seeds live and when they are evaluated."""
+_MAY_DIFFER = {"seed", "group", *run_folder.NOT_COMPARED} - {"seeds"}
 
 
 class Run(NamedTuple):
@@ -36,7 +41,8 @@ class CellSeeds(NamedTuple):
 
     Attributes:
         pair: what a seed is paired by: its study's seed and its own number.
-        expert: whose demonstrations it has, -1 for none or several.
+        expert: whose demonstrations it has, -1 for none or several. Studies have experts of their
+            own, unless all read one file of demonstrations.
         diverged: bool.
         statistics: of its evaluations by steps.
         expert_return: of its expert on the evaluation starts; NaN if it has none.
@@ -67,15 +73,15 @@ class Pooled(NamedTuple):
         cells: by name, in the order of the runs' tables.
         config: of the first run.
         threshold: return that counts as solved.
-        most: the last environment step that a seed can reach.
-        by_episodes: whether episodes end the seeds, at different steps.
+        steps: the last environment step that a seed can reach.
+        episodes: after which every seed ends, at different steps; None where steps can end it.
     """
 
     cells: dict[CellName, CellSeeds]
     config: dict[str, Any]
     threshold: float
-    most: int
-    by_episodes: bool
+    steps: int
+    episodes: int | None
 
 
 def load(folder: Path) -> Run:
@@ -99,7 +105,7 @@ def pool(runs: Sequence[Run]) -> Pooled:
     """
     found: dict[CellName, list[CellSeeds]] = {}
     for run in runs:
-        _check_alike(runs[0], run)
+        check_alike(runs[0], run)
         with undamaged(run.folder):
             for name, cell in _cells(run).items():
                 found.setdefault(name, []).append(cell)
@@ -111,15 +117,26 @@ def pool(runs: Sequence[Run]) -> Pooled:
     first = runs[0].config
     with undamaged(runs[0].folder):
         spec = envs.make(first["env"]).spec
-        episodes, most = first["max_episodes"], first["max_steps"]
-        if most is None:
-            most = episodes * spec.max_episode_steps
-        return Pooled(pooled, first, spec.reward_threshold, int(most), episodes is not None)
+        episodes, steps = first["max_episodes"], first["max_steps"] or np.inf
+        longest = np.inf if episodes is None else episodes * spec.max_episode_steps
+        ends = episodes if longest <= steps else None
+        return Pooled(pooled, first, spec.reward_threshold, int(min(steps, longest)), ends)
 
 
-def _check_alike(first: Run, other: Run) -> None:
-    for name in sorted(first.config.keys() | other.config.keys()):
-        if name not in _MAY_DIFFER and first.config.get(name) != other.config.get(name):
+def check_alike(first: Run, other: Run, but: Sequence[str] = ()) -> None:
+    """Check that two runs have one configuration, whatever their study's seed and their cells.
+
+    Args:
+        first: a run.
+        other: another one.
+        but: options that may differ too.
+
+    Raises:
+        UserError: if they have not; it names the option.
+    """
+    mine, others = run_folder.flat(first.config), run_folder.flat(other.config)
+    for name in sorted(mine.keys() | others.keys()):
+        if name not in _MAY_DIFFER and name not in but and mine.get(name) != others.get(name):
             raise UserError(
                 f"{other.folder}: its {name} is not that of {first.folder}; give runs of one kind"
             )
@@ -135,13 +152,23 @@ def _cells(run: Run) -> dict[CellName, CellSeeds]:
         run_tables["evaluations"].partition_by(by_cell, as_dict=True, maintain_order=True).items()
     ):
         of_cell = seeds[method, n_demos].sort("seed")
-        found = statistics.of_seeds(rows, of_cell["diverged"].to_numpy(), threshold)
+        found = statistics.of_seeds(
+            rows,
+            of_cell["diverged"].to_numpy(),
+            threshold,
+            by_episodes=config["max_episodes"] is not None,
+        )
         if found.area.size != count or not np.isfinite(found.area).all():
             raise UserError(
                 f"{folder}: {method} has no finite returns of {count} seeds; finish the run first"
             )
-        of_study = pl.col("seed", "expert_id").cast(pl.Int64) + study * 2**32
-        numbers = of_cell.select(of_study, cs.starts_with("best_", "expert_return"))
+        offset = study * 2**32
+        own = offset if config.get("demos") is None else 0
+        numbers = of_cell.select(
+            pl.col("seed").cast(pl.Int64) + offset,
+            pl.col("expert_id").cast(pl.Int64) + own,
+            cs.starts_with("best_", "expert_return"),
+        )
         cells[method, n_demos] = CellSeeds(
             pair=numbers["seed"].to_numpy(),
             expert=numbers["expert_id"].fill_null(-1).to_numpy(),
@@ -150,7 +177,7 @@ def _cells(run: Run) -> dict[CellName, CellSeeds]:
             expert_return=numbers["expert_return"].fill_null(np.nan).to_numpy(),
             best_evaluation=numbers["best_evaluation"].to_numpy(),
             best_return=numbers["best_return"].to_numpy(),
-            evaluations=rows.with_columns(pair=study * 2**32 + pl.col("seed").cast(pl.Int64)),
+            evaluations=rows.with_columns(pair=pl.col("seed").cast(pl.Int64) + offset),
         )
     return cells
 

@@ -87,7 +87,14 @@ def report(folder: Path, redraw: bool = False) -> Report:
     files = figures.files(folder / "figures", summary)
     wrong = []
     if redraw or not all(file.exists() for of_figure in files.values() for file in of_figure):
-        wrong = _draw(folder, run_tables, summary, threshold)
+        figures.draw(
+            folder / "figures",
+            run_tables,
+            summary,
+            threshold,
+            wrong.append,
+            by_episodes=config["max_steps"] is None,
+        )
     # Verdicts, of a run that is whole.
     judged = []
     if config["seeds"] > 1 and summary["seeds"].to_list() == [config["seeds"]] * _asked(config):
@@ -126,25 +133,6 @@ def summarise(
         ],
         infer_schema_length=None,
     )
-
-
-def _draw(
-    folder: Path,
-    run_tables: dict[str, pl.DataFrame],
-    summary: pl.DataFrame,
-    threshold: float,
-) -> list[str]:
-    wrong = []
-    figures.draw(
-        folder / "figures",
-        run_tables["evaluations"],
-        run_tables["episodes"],
-        run_tables["seeds"],
-        summary,
-        threshold,
-        wrong.append,
-    )
-    return wrong
 
 
 if __name__ == "__main__":

@@ -96,7 +96,10 @@ def _near_expert(evidence: Evidence, name: CellName) -> Part | None:
     run = evidence.run_with(name, by_episodes=True)
     if run is None:
         return None
-    behind = _behind_experts(run, name, episodes=120)
+    scores = _experts_returns(run)
+    if not set(run.cells[name].pair.tolist()) <= scores.keys():
+        return Part(f"{said(name)}: no table says what its seeds' experts return", "unclear")
+    behind = _behind_experts(run, name, scores, episodes=120)
     if behind is None:
         return Part(f"{said(name)}: some seeds live no 120 episodes here", "unclear")
     outcome: Outcome = "unclear"
@@ -108,15 +111,21 @@ def _near_expert(evidence: Evidence, name: CellName) -> Part | None:
     return Part(f"{said(name)}, {measured}", outcome)
 
 
-def _behind_experts(run: Pooled, name: CellName, episodes: int) -> Interval | None:
-    """Return minus the expert's at each seed's first evaluation from so many episodes on."""
-    cell = run.cells[name]
-    expert = {
+def _experts_returns(run: Pooled) -> dict[int, float]:
+    """By pair, the return of its expert, whom every method of a pair shares."""
+    return {
         pair: score
-        for other in run.cells.values()
-        for pair, score in zip(other.pair.tolist(), other.expert_return.tolist(), strict=True)
+        for cell in run.cells.values()
+        for pair, score in zip(cell.pair.tolist(), cell.expert_return.tolist(), strict=True)
         if np.isfinite(score)
     }
+
+
+def _behind_experts(
+    run: Pooled, name: CellName, scores: dict[int, float], episodes: int
+) -> Interval | None:
+    """Return minus the expert's at each seed's first evaluation from so many episodes on."""
+    cell = run.cells[name]
     reached = (
         cell.evaluations.filter(pl.col("episode") >= episodes, pl.col("protocol") != "soft")
         .sort("episode", "env_step")
@@ -124,10 +133,10 @@ def _behind_experts(run: Pooled, name: CellName, episodes: int) -> Interval | No
         .first()
         .sort("pair")
     )
-    if reached.height < cell.pair.size or not set(cell.pair.tolist()) <= expert.keys():
+    if reached.height < cell.pair.size:
         return None
-    scores = np.array([expert[pair] for pair in reached["pair"].to_list()])
-    difference = reached["return_mean"].cast(pl.Float64).to_numpy() - scores
+    expert = np.array([scores[pair] for pair in reached["pair"].to_list()])
+    difference = reached["return_mean"].cast(pl.Float64).to_numpy() - expert
     clusters = cell.expert[np.argsort(cell.pair)]
     return intervals.mean(difference, clusters=clusters if (clusters >= 0).all() else None)
 
@@ -138,12 +147,12 @@ def _shown(interval: Interval, form: str = "{:+.2f}") -> str:
 
 
 def _best_of_all(evidence: Evidence) -> Claim:
-    best = evidence.largest("hs-me-ddpg")
     parts: list[Part | None] = []
-    for method in PAPER_METHODS[:3]:
-        other = evidence.largest(method)
-        stable, dips = (evidence.compare(best, other, by) for by in (STABLE, DIPS))
-        parts.append(_differing(evidence.compare(best, other, STEPS), "less"))
+    for other in PAPER_METHODS[:3]:
+        faster, stable, dips = (
+            evidence.compare_methods("hs-me-ddpg", other, by) for by in (STEPS, STABLE, DIPS)
+        )
+        parts.append(_differing(faster, "less"))
         # Where as many seeds stay solved, the share of their evaluations decides.
         alike = stable is not None and stable.equivalent
         parts.append(_differing(dips, "less") if alike else _differing(stable, "more"))
@@ -152,11 +161,8 @@ def _best_of_all(evidence: Evidence) -> Claim:
 
 
 def _fast_then_no_better(evidence: Evidence) -> Claim:
-    name, ddpg = evidence.largest("hs-ddpg"), evidence.largest("ddpg")
-    parts = [
-        _differing(evidence.compare(name, ddpg, STEPS), "less"),
-        _no_better(evidence.compare(name, ddpg, FINAL), "more", "no better"),
-    ]
+    faster, final = (evidence.compare_methods("hs-ddpg", "ddpg", by) for by in (STEPS, FINAL))
+    parts = [_differing(faster, "less"), _no_better(final, "more", "no better")]
     text = "HS-DDPG rises fast, then is no better than DDPG"
     return _claim("C3", text, parts, "No run has both methods.")
 
@@ -174,7 +180,7 @@ def _converges(evidence: Evidence, name: CellName, episodes: int) -> Part | None
     if run is None:
         return None
     found = run.cells[name].statistics.convergence_episode
-    if not run.by_episodes and not np.isfinite(found).all():
+    if run.episodes is None and not np.isfinite(found).all():
         return Part(f"{said(name)}: seeds that failed lived fewer episodes", "unclear")
     median = intervals.median(found)
     low, high = episodes / FACTOR, episodes * FACTOR
@@ -213,9 +219,8 @@ def _exceeds_expert(evidence: Evidence) -> Claim:
 
 
 def _better_than(evidence: Evidence, claim: str, text: str, other: str) -> Claim:
-    reference = evidence.largest(other)
     parts = [
-        _differing(evidence.compare(evidence.largest(method), reference, FINAL), "more")
+        _differing(evidence.compare_methods(method, other, FINAL), "more")
         for method in PAPER_METHODS[2:]
     ]
     return _claim(claim, text, parts, f"No run has {other} beside the methods.")

@@ -140,10 +140,8 @@ def survival(times: np.ndarray) -> Survival:
             for as long: nobody is censored before the last event, so that the interval is Clopper
             and Pearson's.
     """
-    arrived = np.isfinite(times)
-    last = times[arrived].max(initial=0.0)
-    sample = scipy.stats.CensoredData.right_censored(np.where(arrived, times, last), ~arrived)
-    found = scipy.stats.ecdf(sample).sf
+    last = times[np.isfinite(times)].max(initial=0.0)
+    found = scipy.stats.ecdf(_censored(times, last)).sf
     bounds = [share(times > time) for time in found.quantiles]
     return Survival(
         found.quantiles,
@@ -151,3 +149,26 @@ def survival(times: np.ndarray) -> Survival:
         np.array([bound.low for bound in bounds]),
         np.array([bound.high for bound in bounds]),
     )
+
+
+def logrank(times: np.ndarray, reference: np.ndarray) -> float:
+    """p-value of the log-rank test that two groups of seeds arrive alike.
+
+    It takes the groups for independent and ignores that seeds are paired: a description, beside
+    `runs.paired`.
+
+    Args:
+        times: `[seeds]`, as for `survival`.
+        reference: `[seeds]` of the other group, watched for as long.
+    """
+    both = np.concatenate([times, reference])
+    if np.unique(both).size == 1:
+        return 1.0
+    last = both[np.isfinite(both)].max()
+    return float(scipy.stats.logrank(_censored(times, last), _censored(reference, last)).pvalue)
+
+
+def _censored(times: np.ndarray, last: float) -> scipy.stats.CensoredData:
+    """The times, with seeds without an event censored after the last event."""
+    arrived = np.isfinite(times)
+    return scipy.stats.CensoredData.right_censored(np.where(arrived, times, last), ~arrived)

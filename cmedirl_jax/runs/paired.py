@@ -3,12 +3,14 @@
 Seed i of every method draws the same networks, starts and noise, and has the same expert. So
 differences are taken within pairs. The null of `p_value` is that their mean is 0. Its statistic is
 studentised, since sign flips of the bare mean reject too often where the two laws have unequal
-shapes. "No effect" is shown by `equivalence`, never by a large p-value.
+shapes. "No effect" is shown by `equivalence`, never by a large p-value; for that, ten pairs are too
+few, and so are ten that differ at all, unless a bound on the differences makes up for them.
 """
 
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy.stats
 
 from cmedirl_jax.runs import intervals
 from cmedirl_jax.runs.intervals import Interval
@@ -16,6 +18,8 @@ from cmedirl_jax.runs.intervals import Interval
 FLIPS = 9_999
 EQUIVALENCE_CONFIDENCE = 0.9
 """Of the interval that has to lie within the margins: two one-sided tests at 5%."""
+LEAST_PAIRS = 10
+"""Fewer pairs, or clusters of them, show no equivalence: their bootstrap covers far too little."""
 
 Equivalence = Literal["equivalent", "different", "inconclusive"]
 
@@ -26,7 +30,7 @@ class Difference(NamedTuple):
     Attributes:
         mean: of the differences, with its 95% interval.
         p_value: see `p_value`.
-        narrow: the mean with its 90% interval, for `equivalence`.
+        narrow: the mean with its 90% interval, for `equivalence`; unbounded for few pairs.
         pairs: how many.
     """
 
@@ -37,7 +41,11 @@ class Difference(NamedTuple):
 
 
 def compare(
-    values: np.ndarray, reference: np.ndarray, clusters: np.ndarray | None = None
+    values: np.ndarray,
+    reference: np.ndarray,
+    clusters: np.ndarray | None = None,
+    *,
+    span: float = np.inf,
 ) -> Difference:
     """Compare `[pairs]` values with the reference's.
 
@@ -45,14 +53,36 @@ def compare(
         values: finite.
         reference: of the same seeds.
         clusters: `[pairs]`, which pairs share an expert; None: none do.
+        span: no pair can differ by more.
     """
     difference = values - reference
     return Difference(
         intervals.mean(difference, clusters=clusters),
         p_value(difference, clusters),
-        intervals.mean(difference, clusters=clusters, confidence=EQUIVALENCE_CONFIDENCE),
+        _narrow(difference, clusters, span),
         difference.size,
     )
+
+
+def _narrow(difference: np.ndarray, clusters: np.ndarray | None, span: float) -> Interval:
+    """The mean with an interval whose two ends hold at 95% each, also where few pairs differ."""
+    found = intervals.mean(difference, clusters=clusters, confidence=EQUIVALENCE_CONFIDENCE)
+    units = np.arange(difference.size) if clusters is None else clusters
+    if np.unique(units).size == 1:
+        units = np.arange(difference.size)
+    count = np.unique(units).size
+    if count < LEAST_PAIRS:
+        return Interval(found.estimate, -np.inf, np.inf)
+    below, above = (np.unique(units[side]).size for side in (difference < 0, difference > 0))
+    if below + above >= intervals.LEAST_EVENTS:
+        return found
+    # A bootstrap knows nothing of differences that it did not see. The mean is at most the span
+    # times the probability of a difference on that side, which has an exact bound.
+    low, high = (
+        span * scipy.stats.binomtest(side, count).proportion_ci(EQUIVALENCE_CONFIDENCE).high
+        for side in (below, above)
+    )
+    return Interval(found.estimate, -low, high)
 
 
 def p_value(difference: np.ndarray, clusters: np.ndarray | None) -> float:
@@ -84,8 +114,6 @@ def _studentised(sums: np.ndarray) -> np.ndarray:
 def equivalence(difference: Difference, margin: float) -> Equivalence:
     """Whether the mean difference is within `margin` of 0, beyond it, or neither is shown."""
     narrow = difference.narrow
-    if difference.pairs < 2:
-        return "inconclusive"
     if narrow.within(-margin, margin):
         return "equivalent"
     if narrow.low > margin or narrow.high < -margin:

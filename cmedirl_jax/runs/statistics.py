@@ -20,7 +20,7 @@ LABELS = ("study", "expert", "method", "n_demos")
 
 
 class SeedCurve(NamedTuple):
-    """One seed's evaluations by steps, in order, leaves `[evaluations]`."""
+    """One seed's evaluations of one protocol, in order, leaves `[evaluations]`."""
 
     env_step: np.ndarray
     episode: np.ndarray
@@ -36,7 +36,7 @@ class SeedStatistics(NamedTuple):
         sustained: it converged, and every later evaluation is at the threshold too.
         dip_fraction: share of the evaluations after the first at the threshold that fall below it;
             NaN if it never converged or nothing came after.
-        area: mean return over the evaluations, each counted alike.
+        area: mean return over the evaluations, each counted alike; see `of_seeds`.
         final_return: return at the last evaluation.
         return_after_convergence: mean return from convergence on; NaN if it never converged.
     """
@@ -73,9 +73,9 @@ def seed_statistics(curve: SeedCurve, threshold: float, missing: int = 0) -> See
     )
 
 
-def curves(evaluations: pl.DataFrame) -> dict[int, SeedCurve]:
-    """A cell's evaluations by steps, seed by seed."""
-    rows = evaluations.filter(pl.col("protocol") == "steps").sort("seed", "env_step")
+def curves(evaluations: pl.DataFrame, protocol: str = "steps") -> dict[int, SeedCurve]:
+    """A cell's evaluations of a protocol, seed by seed."""
+    rows = evaluations.filter(pl.col("protocol") == protocol).sort("seed", "env_step")
     return {
         int(group["seed"][0]): SeedCurve(
             group["env_step"].to_numpy(),
@@ -86,15 +86,33 @@ def curves(evaluations: pl.DataFrame) -> dict[int, SeedCurve]:
     }
 
 
-def of_seeds(evaluations: pl.DataFrame, diverged: np.ndarray, threshold: float) -> SeedStatistics:
+def of_seeds(
+    evaluations: pl.DataFrame,
+    diverged: np.ndarray,
+    threshold: float,
+    *,
+    by_episodes: bool = False,
+) -> SeedStatistics:
     """Statistics of every seed of a cell, leaves `[seeds]` float.
 
     Args:
         evaluations: the cell's rows of evaluations.parquet.
         diverged: `[seeds]` bool.
         threshold: the return that counts as solved.
+        by_episodes: whether episodes end the seeds, at different steps. Then `area` is over the
+            evaluations by episodes where there are any: by steps, a seed's failures, whose episodes
+            are long, would count more than its successes.
     """
-    by_seed = curves(evaluations)
+    found = _of_curves(curves(evaluations), diverged, threshold)
+    over_episodes = curves(evaluations, "episodes") if by_episodes else {}
+    if len(over_episodes) == len(diverged):
+        found = found._replace(area=_of_curves(over_episodes, diverged, threshold).area)
+    return found
+
+
+def _of_curves(
+    by_seed: dict[int, SeedCurve], diverged: np.ndarray, threshold: float
+) -> SeedStatistics:
     longest = max(curve.return_mean.size for curve in by_seed.values())
     # A diverged seed misses one at least, also where all seeds of the cell diverged together.
     rows = [
@@ -127,7 +145,8 @@ def summarise(
             evaluation and no convergence.
     """
     diverged = seeds["diverged"].to_numpy()
-    statistics = of_seeds(evaluations, diverged, threshold)
+    by_episodes = max_episodes is not None
+    statistics = of_seeds(evaluations, diverged, threshold, by_episodes=by_episodes)
     lived = seeds.filter(~pl.col("diverged"))["episodes"].to_numpy()
     first = evaluations.row(0, named=True)
     clusters = experts_of(seeds)
@@ -276,17 +295,14 @@ def _costs(seeds: pl.DataFrame) -> dict[str, Any]:
     return seeds.select(
         env_steps_learner=pl.col("env_steps").cast(pl.Int64).sum(),
         env_steps_demonstrations=pl.col("demonstration_steps").cast(pl.Int64).sum(),
-        env_steps_expert=_expert_steps(),
+        # Once for each expert, also where several seeds share it.
+        env_steps_expert=pl.col("expert_steps")
+        .filter(pl.col("expert_id").is_first_distinct())
+        .sum(),
         diverged=pl.col("diverged").sum(),
         gymnasium_return_mean=pl.col("gymnasium_return").mean(),
         gymnasium_difference_max=pl.col("gymnasium_difference").max(),
     ).row(0, named=True)
-
-
-def _expert_steps() -> pl.Expr:
-    """Steps of all experts: each learner's own are its own, shared ones count once."""
-    own = pl.col("expert").first() == "each"
-    return pl.when(own).then(pl.col("expert_steps").sum()).otherwise(pl.col("expert_steps").first())
 
 
 def _from_zero(interval: Interval) -> Interval:

@@ -5,7 +5,7 @@ import pytest
 
 from cmedirl_jax.runs import statistics
 from cmedirl_jax.training.methods import METHODS
-from experiments import figures
+from experiments import curves, distributions, figures
 from tests.support.cells import seeds_table
 
 THRESHOLD = 90.0
@@ -21,6 +21,22 @@ def _close_figures():
     plt.close("all")
 
 
+def draw(folder, cells, seeds=3, **options):
+    """The files of all figures of a run."""
+    evaluations, episodes, every_seed, summary = run(cells, seeds)
+    # `figures.draw` looks up whose demonstrations a seed has.
+    tables = {
+        "evaluations": evaluations.drop("expert_id"),
+        "episodes": episodes.drop("expert_id"),
+        "seeds": every_seed,
+    }
+    return figures.draw(folder, tables, summary, THRESHOLD, **options)
+
+
+def over(evaluations):
+    return curves.over(evaluations, by_episodes=False)
+
+
 def run(cells, seeds=3):
     """The tables and the summary of a run whose cells have these curves.
 
@@ -34,6 +50,7 @@ def run(cells, seeds=3):
                 "n_demos": n_demos,
                 "protocol": protocol,
                 "seed": seed,
+                "expert_id": seed,
                 "env_step": env_step,
                 "episode": env_step // 250,
                 "return_mean": value + seed if protocol == "steps" else 1e6,
@@ -56,6 +73,7 @@ def run(cells, seeds=3):
                 "seed": seed,
                 "episode": episode,
                 "return": 10.0 * episode + seed,
+                "expert_id": seed,
             }
             for method, n_demos in cells
             for seed in range(seeds)
@@ -95,13 +113,13 @@ TWO_NUMBERS = {
 @pytest.mark.parametrize(
     ("cells", "names"),
     [
-        (ONE_NUMBER, ["figure3", "survival", "critic", "cost"]),
-        (TWO_NUMBERS, ["figure3", "survival", "critic", "cost", "figure4", "figure5"]),
-        ({("ddpg", 0): NEVER}, ["figure3", "survival", "critic", "cost"]),
+        (ONE_NUMBER, ["figure3", "survival", "profile", "critic", "cost"]),
+        (TWO_NUMBERS, ["figure3", "survival", "profile", "critic", "cost", "figure4", "figure5"]),
+        ({("ddpg", 0): NEVER}, ["figure3", "survival", "profile", "critic", "cost"]),
     ],
 )
 def test_figures_4_and_5_need_several_numbers_of_demonstrations(cells, names, tmp_path):
-    paths = figures.draw(tmp_path / "figures", *run(cells), THRESHOLD)
+    paths = draw(tmp_path / "figures", cells)
     expected = {f"{name}.{suffix}" for name in names for suffix in ("png", "svg")}
     assert {path.name for path in paths} == expected
     assert {path.name for path in (tmp_path / "figures").iterdir()} == expected
@@ -110,19 +128,18 @@ def test_figures_4_and_5_need_several_numbers_of_demonstrations(cells, names, tm
 
 
 def test_the_same_tables_give_the_same_bytes(tmp_path):
-    tables = run(TWO_NUMBERS)
-    first, second = (figures.draw(tmp_path / name, *tables, THRESHOLD) for name in ("a", "b"))
+    first, second = (draw(tmp_path / name, TWO_NUMBERS) for name in ("a", "b"))
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
 
 
 def test_cells_that_never_converged_can_be_drawn(tmp_path):
     cells = dict.fromkeys(TWO_NUMBERS, NEVER)
-    assert figures.draw(tmp_path / "figures", *run(cells, seeds=1), THRESHOLD)
+    assert draw(tmp_path / "figures", cells, seeds=1)
 
 
 def test_figure_3_has_the_mean_of_the_seeds_over_steps():
     evaluations, episodes, _, _ = run({("ddpg", 0): LATE})
-    left, _ = figures.average_return(evaluations, episodes, None, THRESHOLD).axes
+    left, _ = figures.average_return(over(evaluations), episodes, None, THRESHOLD).axes
     curve = left.lines[0]
     assert curve.get_label() == "DDPG"
     np.testing.assert_array_equal(curve.get_xdata(), STEPS)
@@ -133,18 +150,18 @@ def test_figure_3_shows_the_largest_number_of_demonstrations_alone(tmp_path, mon
     drawn = {}
 
     def average_return(evaluations, episodes, *_):
-        drawn.update(evaluations=evaluations, episodes=episodes)
+        drawn.update(evaluations=evaluations.rows, episodes=episodes)
         return plt.figure()
 
     monkeypatch.setattr(figures, "average_return", average_return)
-    figures.draw(tmp_path / "figures", *run(TWO_NUMBERS), THRESHOLD)
+    draw(tmp_path / "figures", TWO_NUMBERS)
     for table in drawn.values():
         assert set(table["n_demos"]) == {0, 10}
 
 
 def test_a_curve_over_episodes_stops_where_the_first_seed_runs_out():
     evaluations, episodes, _, _ = run({("ddpg", 0): LATE})
-    _, right = figures.average_return(evaluations, episodes, None, THRESHOLD).axes
+    _, right = figures.average_return(over(evaluations), episodes, None, THRESHOLD).axes
     curve = right.lines[0]
     np.testing.assert_array_equal(curve.get_xdata(), [1, 2])
     np.testing.assert_allclose(curve.get_ydata(), [11.0, 21.0])
@@ -153,7 +170,7 @@ def test_a_curve_over_episodes_stops_where_the_first_seed_runs_out():
 def test_a_method_with_a_seed_that_finished_no_episode_has_no_curve_over_episodes():
     evaluations, episodes, _, _ = run({("ddpg", 0): LATE})
     episodes = episodes.filter(pl.col("seed") > 0)
-    _, right = figures.average_return(evaluations, episodes, None, THRESHOLD).axes
+    _, right = figures.average_return(over(evaluations), episodes, None, THRESHOLD).axes
     assert [line.get_label() for line in right.lines] == ["solved"]
 
 
@@ -170,27 +187,52 @@ def test_figure_4_leaves_out_what_never_converged():
 def test_many_methods_have_a_panel_each():
     cells = {(method, 0): LATE for method in list(METHODS)[:6]}
     evaluations, episodes, _, _ = run(cells)
-    figure = figures.average_return(evaluations, episodes, 94.0, THRESHOLD)
+    figure = figures.average_return(over(evaluations), episodes, 94.0, THRESHOLD)
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert titles == [METHODS[method].label for method, _ in cells]
     assert [axes.axison for axes in figure.axes] == [True] * 6 + [False] * 2
     np.testing.assert_allclose(figure.axes[1].lines[1].get_ydata(), np.add(LATE, 1.0))
 
 
+def test_a_run_over_episodes_is_drawn_over_episodes(tmp_path):
+    evaluations, episodes, _, _ = run({("ddpg", 0): LATE})
+    by_episodes = curves.over(evaluations, by_episodes=True)
+    left, _ = figures.average_return(by_episodes, episodes, None, THRESHOLD).axes
+    np.testing.assert_array_equal(left.lines[0].get_xdata(), [0, 1, 2])
+    assert left.get_xlabel() == "episodes"
+    assert draw(tmp_path / "figures", ONE_NUMBER, by_episodes=True)
+
+
+def statistics_of(cells):
+    evaluations, _, seeds, _ = run(cells)
+    return distributions.of_methods(evaluations, seeds, THRESHOLD, by_episodes=False)
+
+
 def test_survival_is_the_share_that_has_not_solved_the_task():
-    evaluations, _, _, _ = run({("ddpg", 0): (0.0, 89.0, 95.0), ("hs-ddpg", 10): NEVER})
-    (axes,) = figures.survival(evaluations, THRESHOLD).axes
+    found = statistics_of({("ddpg", 0): (0.0, 89.0, 95.0), ("hs-ddpg", 10): NEVER})
+    (axes,) = distributions.survival(found, 500.0, by_episodes=False).axes
     ddpg, never = axes.lines
     # Seed i returns i more: the first solves it at step 500, the others at step 250.
     by_step = dict(zip(ddpg.get_xdata(), ddpg.get_ydata(), strict=True))
     assert by_step[250.0] == pytest.approx(1 / 3)
     assert by_step[500.0] == pytest.approx(0.0, abs=1e-12)
     assert set(never.get_ydata()) == {1.0}
+    assert never.get_label().startswith("HS-DDPG, p = 0.0")
+    (axes,) = distributions.survival(found, 2.0, by_episodes=True).axes
+    assert max(axes.lines[0].get_xdata()) == 2.0
+
+
+def test_a_profile_is_the_share_of_seeds_above_each_score():
+    _, last = distributions.profile(statistics_of({("ddpg", 0): LATE})).axes
+    scores, above = last.lines[0].get_data()
+    # The seeds return 95, 96 and 97 in the end.
+    np.testing.assert_array_equal(scores, [0.0, 95.0, 96.0, 97.0, 97.0])
+    np.testing.assert_allclose(above, [1.0, 2 / 3, 1 / 3, 0.0, 0.0])
 
 
 def test_the_critics_values_and_losses_are_means_over_the_seeds():
     evaluations, _, _, _ = run({("ddpg", 0): LATE})
-    values, losses = (axes.lines[0] for axes in figures.critic(evaluations).axes)
+    values, losses = (axes.lines[0] for axes in figures.critic(over(evaluations)).axes)
     # Before the first update there are none.
     np.testing.assert_array_equal(values.get_xdata(), STEPS[1:])
     np.testing.assert_allclose(values.get_ydata(), 2.0 * np.array(STEPS[1:]) + 1.0)

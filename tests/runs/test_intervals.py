@@ -141,3 +141,27 @@ def test_where_nobody_arrives_everybody_is_left():
     found = intervals.survival(np.full(5, NEVER))
     np.testing.assert_array_equal([found.share[-1], found.high[-1]], [1.0, 1.0])
     assert 0.4 < found.low[-1] < 0.6
+
+
+def test_the_log_rank_test_is_scipys_with_both_groups_watched_as_long():
+    rng = np.random.default_rng(0)
+    times, reference = np.ceil(rng.exponential(3.0, 40)), np.full(40, NEVER)
+    reference[:5] = 9.0
+    ends = scipy.stats.CensoredData.right_censored(
+        np.r_[np.full(5, 9.0), np.full(35, 99.0)], reference == NEVER
+    )
+    expected = scipy.stats.logrank(scipy.stats.CensoredData(times), ends).pvalue
+    assert intervals.logrank(times, reference) == pytest.approx(expected)
+    assert intervals.logrank(times, np.full(40, NEVER)) < 1e-6
+
+
+@pytest.mark.parametrize("time", [0.0, 5.0, NEVER])
+def test_groups_that_all_arrive_at_once_or_never_are_alike(time):
+    assert intervals.logrank(np.full(6, time), np.full(4, time)) == 1.0
+
+
+def test_the_log_rank_test_rejects_equal_laws_at_its_level():
+    def p_value(trial):
+        return intervals.logrank(*np.ceil(np.random.default_rng(trial).exponential(3.0, (2, 50))))
+
+    assert np.mean([p_value(trial) <= 0.05 for trial in range(300)]) <= 0.08

@@ -14,10 +14,10 @@ def rejections(draw, trials=200, level=0.05):
 
 
 def test_a_difference_is_of_pairs():
-    values, reference = np.array([3.0, 5.0, 9.0]), np.array([1.0, 2.0, 3.0])
+    values, reference = np.array([3.0, 5.0, 9.0] * 4), np.array([1.0, 2.0, 3.0] * 4)
     found = paired.compare(values, reference)
     assert found.mean.estimate == pytest.approx(11 / 3)
-    assert found.pairs == 3
+    assert found.pairs == 12
     assert found.mean.low <= found.narrow.low <= found.narrow.high <= found.mean.high
 
 
@@ -38,6 +38,37 @@ def test_one_pair_shows_nothing():
     found = paired.compare(np.array([5.0]), np.array([1.0]))
     assert found.p_value == 1.0
     assert paired.equivalence(found, 10.0) == paired.equivalence(found, 1.0) == "inconclusive"
+
+
+@pytest.mark.parametrize("clusters", [None, np.arange(40) % 9])
+def test_few_pairs_or_clusters_of_them_show_no_equivalence(clusters):
+    values = np.random.default_rng(0).normal(0.0, 0.01, 9 if clusters is None else 40)
+    found = paired.compare(values, np.zeros(values.size), clusters)
+    assert paired.equivalence(found, 1.0) == "inconclusive"
+    assert np.isfinite(found.mean).all()
+
+
+def test_where_no_pair_differs_the_unseen_differences_have_an_exact_bound():
+    def found(pairs, span, margin):
+        same = np.zeros(pairs)
+        return paired.equivalence(paired.compare(same, same, span=span), margin)
+
+    # One-sided, at most 1 - 0.05^(1/n): 0.0295 of 100 pairs, 0.00994 of 300.
+    assert found(100, 1.0, 0.02) == "inconclusive"
+    assert found(300, 1.0, 0.02) == "equivalent"
+    assert found(100, 12_000.0, 500.0) == "equivalent"
+    assert found(100, 20_000.0, 500.0) == "inconclusive"
+    assert found(100, np.inf, 500.0) == "inconclusive"
+
+
+def test_shares_on_the_margin_are_called_equivalent_in_at_most_a_twentieth():
+    """One pair in fifty differs, all to one side."""
+
+    def found(trial):
+        differs = (np.random.default_rng(trial).random(150) < 0.02).astype(float)
+        return paired.equivalence(paired.compare(differs, np.zeros(150), span=1.0), 0.02)
+
+    assert np.mean([found(trial) == "equivalent" for trial in range(300)]) <= 0.06
 
 
 def test_a_difference_in_every_pair_is_evidence():

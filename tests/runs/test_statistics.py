@@ -185,6 +185,25 @@ def test_statistics_over_episodes_are_restricted_where_episodes_bind_and_missing
         assert by_steps[f"convergence_episode_{name}"] is None
 
 
+def test_where_episodes_end_the_seeds_the_area_is_over_evaluations_by_episodes():
+    evaluations = evaluations_of([0, 92, 92], [0, 0, 92])
+    found = statistics.summarise(evaluations, seeds_table(2), 90.0, max_episodes=8)
+    assert found["area"] == 1e6
+    by_steps = evaluations.filter(pl.col("protocol") == "steps")
+    found = statistics.summarise(by_steps, seeds_table(2), 90.0, max_episodes=8)
+    assert found["area"] == pytest.approx(276 / 6)
+
+
+def test_experts_that_seeds_share_are_paid_for_once():
+    evaluations = evaluations_of([0, 92], [0, 92], [0, 92])
+    seeds = seeds_table(3, expert_id=[4, 7, 4])
+    row = statistics.summarise(evaluations, seeds, 90.0, max_episodes=None)
+    assert row["env_steps_expert"] == 2 * 4_000
+    nobody = seeds_table(3, expert_id=[None] * 3)
+    row = statistics.summarise(evaluations, nobody, 90.0, max_episodes=None)
+    assert row["env_steps_expert"] == 4_000
+
+
 def test_a_diverged_seed_is_no_fast_one():
     """It is restricted at the run's episodes, not at those that it lived."""
     row = statistics.summarise(

@@ -29,10 +29,11 @@ FILES = (
 CELLS_ASKED = ("methods", "n_demos", "seeds")
 """The options that say which cells there are. The same folder may be given others."""
 _LOCK = ".lock"
-_NOT_COMPARED = (
+NOT_COMPARED = (
     *("out", "grid", "devices", "distributed", "coordinator", "processes", "process_id"),
     *("checkpoint_every", "check_demos", *CELLS_ASKED),
 )
+"""The options that runs of one configuration may differ in."""
 
 
 def check(folder: Path, config: dict[str, Any]) -> None:
@@ -226,7 +227,7 @@ def other_versions(folder: Path) -> dict[str, str]:
 
 def identity(config: dict[str, Any]) -> dict[str, Any]:
     """JSON values that a checkpoint shares with a run that continues it."""
-    compared = {name: value for name, value in flat(config).items() if name not in _NOT_COMPARED}
+    compared = {name: value for name, value in flat(config).items() if name not in NOT_COMPARED}
     digest = hashlib.sha256(json.dumps(compared, sort_keys=True).encode()).hexdigest()
     return {"config": digest, **versions(), **numerics.current()}
 
@@ -245,7 +246,7 @@ def _compare(folder: Path, config: dict[str, Any]) -> None:
             )
     before, now = flat(written["config"]), flat(config)
     for name in sorted(before.keys() | now.keys()):
-        if name not in _NOT_COMPARED and before.get(name) != now.get(name):
+        if name not in NOT_COMPARED and before.get(name) != now.get(name):
             raise UserError(
                 f"--out: {folder} holds a run with {_option(name)} {before.get(name)}, not "
                 f"{now.get(name)}; choose another folder or the same configuration"
