@@ -10,6 +10,7 @@ COMMANDS = (
     "checkpoint_cost",
     "soak",
     "scaling",
+    "coverage",
     "worker",
 )
 

@@ -76,10 +76,19 @@ class Over(NamedTuple):
 
 
 def over(evaluations: pl.DataFrame, by_episodes: bool) -> Over:
-    """Evaluations over the unit in which all seeds live as long: steps, or episodes."""
-    of_episodes = evaluations.filter(pl.col("protocol") == "episodes")
-    if by_episodes and of_episodes.height:
-        return Over(of_episodes, "episode", "episodes")
+    """Evaluations over the unit in which all seeds live as long: steps, or episodes.
+
+    Seeds are evaluated at the end of the chunk in which they finish so many episodes: each one's
+    n-th evaluation is drawn at the median of their numbers of episodes.
+    """
+    of_episodes = evaluations.filter(
+        (pl.col("protocol") == "episodes") | (pl.col("env_step") == 0), pl.col("protocol") != "soft"
+    )
+    if by_episodes and of_episodes["env_step"].max():
+        order = pl.int_range(pl.len()).over("method", "n_demos", "seed", order_by="env_step")
+        episode = pl.col("episode").cast(pl.Float64).median().over("order")
+        rows = of_episodes.with_columns(order=order).with_columns(episode=episode)
+        return Over(rows, "episode", "episodes")
     by_steps = evaluations.filter(pl.col("protocol") == "steps")
     return Over(by_steps, "env_step", "environment steps")
 

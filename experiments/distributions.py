@@ -64,9 +64,9 @@ def profile(found: dict[str, SeedStatistics]) -> Figure:
     )
     for axes, title, of in scores:
         values = {method: np.sort(of(one)) for method, one in found.items()}
-        ends = np.concatenate([[0.0], *values.values()])
+        ends = np.concatenate([[], *values.values()])
         for method, one in values.items():
-            at = np.r_[ends.min(), one, ends.max()]
+            at = np.r_[ends.min() - 1.0, one, ends.max()]
             bounds = np.array([intervals.share(one > score) for score in at])
             line = lines[method] | {"label": METHODS[method].label or method}
             axes.step(at, bounds[:, 0], where="post", **line)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from benchmarks import (
     checkpoint_cost,
+    coverage,
     main_job,
     measuring,
     naive,
@@ -448,3 +449,13 @@ def test_the_main_jobs_process_writes_its_phases(monkeypatch, tmp_path):
     spent = json.loads((tmp_path / "answer").read_text())
     assert spent["training"] >= 0.01
     assert spent["compilation"] == 0.0
+
+
+def test_what_is_used_is_right_at_about_the_promised_rate(tmp_path):
+    out = tmp_path / "coverage.csv"
+    assert coverage.main(["--trials", "30", "--out", str(out)]) == 0
+    used = pl.read_csv(out).filter(pl.col("used") & (pl.col("samples") == 30))
+    intervals, tests = (used.filter(pl.col("nominal") == rate)["measured"] for rate in (0.95, 0.05))
+    assert intervals.min() >= 0.8
+    assert tests.max() <= 0.2
+    assert used.height > 15

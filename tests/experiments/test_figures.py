@@ -63,6 +63,7 @@ def run(cells, seeds=3):
             for protocol in ("episodes", "steps")
             for seed in range(seeds)
             for env_step, value in zip(STEPS, curve, strict=True)
+            if env_step or protocol == "steps"
         ]
     )
     episodes = pl.DataFrame(
@@ -199,6 +200,7 @@ def test_a_run_over_episodes_is_drawn_over_episodes(tmp_path):
     by_episodes = curves.over(evaluations, by_episodes=True)
     left, _ = figures.average_return(by_episodes, episodes, None, THRESHOLD).axes
     np.testing.assert_array_equal(left.lines[0].get_xdata(), [0, 1, 2])
+    np.testing.assert_allclose(left.lines[0].get_ydata()[1:], 1e6)
     assert left.get_xlabel() == "episodes"
     assert draw(tmp_path / "figures", ONE_NUMBER, by_episodes=True)
 
@@ -226,7 +228,7 @@ def test_a_profile_is_the_share_of_seeds_above_each_score():
     _, last = distributions.profile(statistics_of({("ddpg", 0): LATE})).axes
     scores, above = last.lines[0].get_data()
     # The seeds return 95, 96 and 97 in the end.
-    np.testing.assert_array_equal(scores, [0.0, 95.0, 96.0, 97.0, 97.0])
+    np.testing.assert_array_equal(scores, [94.0, 95.0, 96.0, 97.0, 97.0])
     np.testing.assert_allclose(above, [1.0, 2 / 3, 1 / 3, 0.0, 0.0])
 
 
