@@ -5,7 +5,10 @@ import re
 import sys
 from collections.abc import Collection
 
-COMMANDS = ("run_grid", "report", "compare", "claims", "optimal_return")
+COMMANDS = (
+    *("run_grid", "report", "compare", "claims"),
+    *("variants", "hot_starts", "optimal_return", "portraits", "film"),
+)
 
 
 def check_command(package: str, commands: Collection[str]) -> None:

@@ -1,0 +1,61 @@
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments import film
+from tests.support import runs
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    runs.save(folder)
+    return folder
+
+
+def test_the_command_films_an_episode(run, tmp_path, capsys):
+    out = tmp_path / "film.gif"
+    options = ["--method", "hs-ddpg", "--n-demos", "7", "--every", "400", "--width", "60"]
+    assert film.main([str(run), *options, "--out", str(out)]) == 0
+    # An untrained policy: the start, steps 400 and 800, and the end at 999.
+    assert capsys.readouterr().out == f"Film: {out}, 4 frames\n"
+    with Image.open(out) as picture:
+        assert (picture.format, picture.size) == ("GIF", (60, 40))
+
+
+def test_frames_follow_the_policy():
+    frames = film.of_episode(
+        lambda observation: np.sign(observation[1:] + 1e-9), "MountainCarContinuous-v0", 0, 10
+    )
+    assert 8 < len(frames) < 20
+    assert all(frame.shape == (400, 600, 3) for frame in frames)
+    assert len({frame.tobytes() for frame in frames}) == len(frames)
+
+
+def test_a_gif_holds_every_frame():
+    shades = [np.full((20, 30, 3), shade, np.uint8) for shade in (0, 128, 255)]
+    with Image.open(io.BytesIO(film.gif(shades, 15))) as picture:
+        assert (picture.n_frames, picture.size) == (3, (15, 10))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["nowhere"], "nowhere: holds no run"),
+        (["{run}", "--method", "gail"], "holds no method gail"),
+        (["{run}", "--method", "hs-ddpg"], "holds several of hs-ddpg, seed 0; give one of"),
+        (["{run}", "--every", "0"], "--every: must be at least 1, got 0"),
+    ],
+)
+def test_mistakes_are_refused_in_a_line(run, arguments, named, capsys):
+    assert film.main([argument.format(run=run) for argument in arguments]) == 2
+    error = capsys.readouterr().err
+    assert named in error
+    assert error.count("\n") == 1
+
+
+def test_a_task_that_gymnasium_cannot_draw_is_refused():
+    with pytest.raises(film.UserError, match="Gymnasium cannot draw it"):
+        film.of_episode(lambda observation: observation, "NoSuchTask-v0", 0, 1)
