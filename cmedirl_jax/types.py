@@ -31,7 +31,8 @@ class EnvSpec(NamedTuple):
         action_low: `[A]` float32, lower bounds of the actions.
         action_high: `[A]` float32, upper bounds of the actions.
         max_episode_steps: environment steps after which an episode is truncated.
-        reward_threshold: the mean return at which the task counts as solved.
+        reward_threshold: the mean return at which the task counts as solved; None where the task
+            does not say.
     """
 
     id: str
@@ -42,7 +43,7 @@ class EnvSpec(NamedTuple):
     action_low: np.ndarray
     action_high: np.ndarray
     max_episode_steps: int
-    reward_threshold: float
+    reward_threshold: float | None
 
 
 class Transition(NamedTuple):

@@ -72,7 +72,7 @@ class Pooled(NamedTuple):
     Attributes:
         cells: by name, in the order of the runs' tables.
         config: of the first run.
-        threshold: return that counts as solved.
+        threshold: return that counts as solved in the first run.
         steps: the last environment step that a seed can reach.
         episodes: after which every seed ends, at different steps; None where steps can end it.
     """
@@ -90,9 +90,10 @@ def load(folder: Path) -> Run:
     Raises:
         UserError: if the folder holds no run, or a damaged one.
     """
-    config = run_folder.read(folder)["config"]
+    written = run_folder.read(folder)
+    config = written["config"]
     with undamaged(folder):
-        threshold = envs.make(config["env"]).spec.reward_threshold
+        threshold = run_folder.solved(folder, written)
         return Run(folder, config, threshold, tables.read(folder, config))
 
 
@@ -120,7 +121,7 @@ def pool(runs: Sequence[Run]) -> Pooled:
         episodes, steps = first["max_episodes"], first["max_steps"] or np.inf
         longest = np.inf if episodes is None else episodes * spec.max_episode_steps
         ends = episodes if longest <= steps else None
-        return Pooled(pooled, first, spec.reward_threshold, int(min(steps, longest)), ends)
+        return Pooled(pooled, first, runs[0].threshold, int(min(steps, longest)), ends)
 
 
 def check_alike(first: Run, other: Run, but: Sequence[str] = ()) -> None:

@@ -9,7 +9,6 @@ from typing import Annotated, Any, NamedTuple
 import polars as pl
 import tyro
 
-from cmedirl_jax import envs
 from cmedirl_jax.runs import statistics
 from cmedirl_jax.runs.console import ending, screen, streams
 from cmedirl_jax.runs.storage import cells, outputs, tables
@@ -73,7 +72,7 @@ def report(folder: Path, redraw: bool = False) -> Report:
     written = run_folder.read(folder)
     config = written["config"]
     run_tables = tables.read(folder, config)
-    threshold = envs.make(config["env"]).spec.reward_threshold
+    threshold = run_folder.solved(folder, written)
     summary = summarise(run_tables, threshold, config["max_episodes"])
     tables.write(folder, run_tables)
     # Figures and verdicts of another summary go before this one comes: those there belong to it.

@@ -81,7 +81,10 @@ def work(config: StudyConfig, fewer_will_do: bool) -> int:
 def _print(console: Console, summary: pl.DataFrame, folder: Path) -> None:
     screen.show(console, summary_table(summary))
     difference = summary["gymnasium_difference_max"].max()
-    console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
+    if difference is None:
+        console.print("The task says of no state in Gymnasium: no episode was repeated there")
+    else:
+        console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
     if summary["diverged"].sum():
         console.print(f"Seeds that diverged and were stopped: {summary['diverged'].sum()}")
     screen.say(console, f"Tables and figures: {folder}")

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import numpy as np
 
 from cmedirl_jax.types import EnvSpec
 
@@ -54,6 +55,8 @@ class Env(NamedTuple):
             for evaluation, which weigh as `reset` draws them.
         state_at: `(observation [O], params) -> state`, the state with that observation, at step 0
             of an episode; None if an observation does not determine the state.
+        gymnasium_state: `(state) -> array`, on the host: what the attribute `state` of Gymnasium's
+            environment of the same name holds there; None if Gymnasium has no such environment.
     """
 
     spec: EnvSpec
@@ -62,3 +65,4 @@ class Env(NamedTuple):
     step: StepFn
     starts: Callable[[int, Any], tuple[Any, jax.Array]]
     state_at: Callable[[jax.Array, Any], Any] | None = None
+    gymnasium_state: Callable[[Any], np.ndarray] | None = None

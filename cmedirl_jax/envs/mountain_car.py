@@ -76,7 +76,7 @@ SPEC = EnvSpec(
 
 def make() -> Env:
     """Make the environment; Gymnasium's physics are its default parameters."""
-    return Env(SPEC, MountainCarParams(), reset, step, starts, state_at)
+    return Env(SPEC, MountainCarParams(), reset, step, starts, state_at, gymnasium_state)
 
 
 def reset(key: jax.Array, params: MountainCarParams) -> tuple[MountainCarState, jax.Array]:
@@ -121,6 +121,11 @@ def state_at(observation: jax.Array, params: MountainCarParams) -> MountainCarSt
     del params
     observation = jnp.asarray(observation, jnp.float32)
     return MountainCarState(observation[0], observation[1], jnp.zeros((), jnp.int32))
+
+
+def gymnasium_state(state: MountainCarState) -> np.ndarray:
+    """`[2]` or `[..., 2]`, the `state` attribute of Gymnasium's environment."""
+    return np.stack([np.asarray(state.position), np.asarray(state.velocity)], axis=-1)
 
 
 def _at_rest(position: jax.Array) -> tuple[MountainCarState, jax.Array]:

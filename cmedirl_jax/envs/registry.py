@@ -2,12 +2,17 @@
 
 from collections.abc import Callable
 
-from cmedirl_jax.envs import mountain_car
+from cmedirl_jax.envs import mountain_car, pendulum, point_mass
 from cmedirl_jax.envs.base import Env
 from cmedirl_jax.registries import Registry
 
 ENVS: Registry[Callable[[], Env]] = Registry(
-    "environment", {mountain_car.SPEC.id: mountain_car.make}
+    "environment",
+    {
+        mountain_car.SPEC.id: mountain_car.make,
+        pendulum.SPEC.id: pendulum.make,
+        point_mass.SPEC.id: point_mass.make,
+    },
 )
 """Maps each name to the function that makes the environment."""
 

@@ -14,7 +14,7 @@ from cmedirl_jax.data.hot_start_data import HotStartData
 from cmedirl_jax.runs import numerics
 from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells import compiled as compiled_lib
-from cmedirl_jax.runs.cells import experts, gymnasium_replay, tabular_cell
+from cmedirl_jax.runs.cells import experts, gymnasium_replay, scale, tabular_cell
 from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.evaluator import Evaluator
@@ -144,7 +144,9 @@ def train_cells(session: Session, todo: Sequence[Cell]) -> None:
     # The demonstrations, and how many steps there are to train.
     stored = cluster.pool_from_writer(load_stored)
     pool = stored if plan.demos is None else plan.demos
-    trains_experts = pool is None and any(cell.n_demos for cell in todo)
+    # Where the task has no threshold, the best expert says what counts as solved.
+    needed = any(cell.n_demos for cell in todo) or plan.env.spec.reward_threshold is None
+    trains_experts = pool is None and needed
     used = None if pool is None else plan.of_learners(pool)
     steps = sum(len(cell.block) * plan.budget.max_steps for cell in todo if cell.method.interacts)
     steps += plan.experts.seeds * plan.experts.steps * trains_experts
@@ -162,12 +164,33 @@ def train_cells(session: Session, todo: Sequence[Cell]) -> None:
             stored_demonstrations.save(plan.folder, pool)
         if pool is not None and cluster.writer:
             run_folder.remove_checkpoints(plan.folder, [EXPERTS])
+        solved = plan.env.spec.reward_threshold if pool is None else _note_scale(session, pool)
+        assert solved is not None
         for cell in todo:
             if session.interruption.came():
                 session.interruption.stop()
             report.start(cell.title)
             with session.checkpointer(cell.name) as checkpointer:
-                _train_cell(session, checkpointer, cell, used, report)
+                _train_cell(session, checkpointer, cell, used, solved, report)
+
+
+def _note_scale(session: Session, pool: Demonstrations) -> float:
+    """Measure the task's returns and rewards, say and store them; what counts as solved."""
+    plan = session.plan
+
+    def measure() -> dict[str, float]:
+        found = scale.measure(plan.env, pool, plan.budget.evaluation_starts)
+        run_folder.note_scale(plan.folder, found._asdict())
+        return found._asdict()
+
+    found = scale.Scale(**session.cluster.from_writer(measure))
+    session.console.print(
+        f"Returns: random actions {found.random:.4g}, best expert {found.expert:.4g}, solved from "
+        f"{found.solved:.4g}. Rewards of a step spread by {found.reward_spread_random:.2g} in "
+        f"random episodes, {found.reward_spread_demonstrated:.2g} in demonstrated ones",
+        highlight=False,
+    )
+    return found.solved
 
 
 def _train_experts(
@@ -191,10 +214,11 @@ def _train_cell(
     checkpointer: Checkpointer,
     cell: Cell,
     pool: LearnersPool | None,
+    solved: float,
     report: Reporter,
 ) -> None:
     """Train a cell, evaluate its best policies, and save it."""
-    result, evaluator = _train(session, checkpointer, cell, pool, report)
+    result, evaluator = _train(session, checkpointer, cell, pool, solved, report)
     plan, fresh_starts = session.plan, session.keys.fresh_starts
 
     # Evaluate each seed's best policy, in JAX and in Gymnasium.
@@ -240,6 +264,7 @@ def _train(
     checkpointer: Checkpointer,
     cell: Cell,
     pool: LearnersPool | None,
+    solved: float,
     report: Reporter,
 ) -> tuple[CellResult, Evaluator]:
     """Train a cell; gives its evaluator too."""
@@ -266,7 +291,7 @@ def _train(
         cell.n_demos,
         **block,
         budget=budget if cell.method.interacts else dataclasses.replace(budget, max_steps=0),
-        threshold=plan.env.spec.reward_threshold,
+        threshold=solved,
         report=_stepwise(report, len(cell.block)),
         checkpointer=checkpointer,
     )

@@ -8,7 +8,7 @@ import numpy as np
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
 from cmedirl_jax.runs.cells import cell as cell_lib
-from cmedirl_jax.runs.cells import recording
+from cmedirl_jax.runs.cells import recording, scale
 from cmedirl_jax.runs.cells.cell import CellResult, Progress
 from cmedirl_jax.runs.cells.compiled import CompiledMethod
 from cmedirl_jax.runs.cells.record import Budget
@@ -47,7 +47,8 @@ def make_pool(
 
     Raises:
         Interrupted: by the checkpointer.
-        UserError: if no expert's final policy reaches the environment's threshold.
+        UserError: if no expert's final policy reaches the environment's threshold, or is better
+            than random actions where it has none.
     """
     # Train.
     train_key, start_key = jax.random.split(key)
@@ -59,12 +60,15 @@ def make_pool(
         0,
         seeds_count=options.seeds,
         budget=Budget(options.steps, None, options.steps, EVALUATION_STARTS),
-        threshold=threshold,
+        threshold=np.inf if threshold is None else threshold,
         report=report,
         checkpointer=checkpointer,
     )
     # Choose who demonstrates, by the final policies' returns.
     returns = _final_returns(result)
+    if threshold is None:
+        random = scale.random_return(env, EVALUATION_STARTS)
+        threshold = scale.solved(random, max(returns.max(), random))
     chosen = choose(returns, options.which, threshold)
     if not chosen.size:
         raise UserError(

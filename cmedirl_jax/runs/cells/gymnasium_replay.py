@@ -22,8 +22,13 @@ class Replay(NamedTuple):
     jax_return: np.ndarray
 
 
-def replay(evaluator: Evaluator, actors: Any, env: Env) -> Replay:
-    """Run each seed's policy `[seeds, ...]` from the same starts in both environments."""
+def replay(evaluator: Evaluator, actors: Any, env: Env) -> Replay | None:
+    """Run each seed's policy `[seeds, ...]` from the same starts in both environments.
+
+    None where the task does not say what Gymnasium's state is.
+    """
+    if env.gymnasium_state is None:
+        return None
     jax_return = evaluator.gather(evaluator.on_starts(actors, STARTS).episode_return)
     act = jax.jit(jax.vmap(evaluator.act))
     return Replay(_run(lambda observations: act(actors, observations), actors, env), jax_return)
@@ -34,15 +39,17 @@ def _run(act: Callable[[jax.Array], jax.Array], actors: Any, env: Env) -> np.nda
 
     Episodes are cut after `env.spec.max_episode_steps` steps, as in JAX.
     """
+    assert env.gymnasium_state is not None
     count = jax.tree.leaves(actors)[0].shape[0]
-    _, observations = env.starts(STARTS, env.default_params)
+    states, observations = env.starts(STARTS, env.default_params)
+    states = env.gymnasium_state(states)
     environments = [[gymnasium.make(env.spec.id) for _ in range(STARTS)] for _ in range(count)]
     current = np.broadcast_to(observations, (count, *observations.shape)).copy()
     for row in environments:
-        for environment, observation in zip(row, np.asarray(observations), strict=True):
+        for environment, state in zip(row, states, strict=True):
             environment.reset(seed=0)
             # Gymnasium has no reset to a given state; for classic control it is the attribute.
-            environment.unwrapped.state = observation.copy()  # type: ignore[attr-defined]
+            environment.unwrapped.state = state.copy()  # type: ignore[attr-defined]
     returns = np.zeros((count, STARTS))
     running = np.ones((count, STARTS), bool)
     for _ in range(env.spec.max_episode_steps):

@@ -11,6 +11,7 @@ from typing import Any
 
 import filelock
 
+from cmedirl_jax import envs
 from cmedirl_jax.io import atomic
 from cmedirl_jax.runs import numerics
 from cmedirl_jax.runs.errors import UserError
@@ -173,6 +174,32 @@ def note_cells_asked(folder: Path, config: dict[str, Any]) -> None:
     _write(folder, written | {"config": now})
 
 
+def note_scale(folder: Path, scale: dict[str, float]) -> None:
+    """Write to config.json where the task's returns lie, see `cells.scale.Scale`."""
+    _write(folder, read(folder) | {"scale": scale})
+
+
+def solved(folder: Path, written: dict[str, Any]) -> float:
+    """The return that counts as solved in a run.
+
+    Args:
+        folder: the run's.
+        written: its config.json.
+
+    Raises:
+        UserError: if the task has no threshold and the run's scale is not known.
+    """
+    scale, config = written.get("scale"), written["config"]
+    try:
+        found = envs.make(config["env"]).spec.reward_threshold if scale is None else scale["solved"]
+        if found is not None:
+            return float(found)
+    except (LookupError, TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"{folder}: config.json names no task and no scale ({reason})") from error
+    raise UserError(f"{folder}: its task has no threshold, and its experts are not trained yet")
+
+
 def _begun(folder: Path) -> bool:
     """Whether something is saved that was trained by config.json; a copy of --demos was not."""
     copied = read(folder)["config"].get("demos") is not None
@@ -188,7 +215,7 @@ def _write(folder: Path, content: dict[str, Any]) -> None:
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """The content of a run's config.json: `config`, `versions` and `numerics`.
+    """The content of a run's config.json: `config`, `versions`, `numerics`, and its `scale`.
 
     Raises:
         UserError: if there is none, or it is damaged or of another version.

@@ -25,7 +25,7 @@ def rows(
     key: CellKey,
     *,
     best_return: np.ndarray,
-    replay: Replay,
+    replay: Replay | None,
     pool: LearnersPool | None,
 ) -> dict[str, pl.DataFrame]:
     """The rows of a finished cell in each table.
@@ -34,7 +34,7 @@ def rows(
         result: the cell.
         key: which cell it is.
         best_return: `[seeds]`, of each seed's best policy on fresh starts.
-        replay: of the same policies.
+        replay: of the same policies; None where there is none.
         pool: of the demonstrations; None for a method without.
     """
     labels = [
@@ -95,7 +95,7 @@ def _seeds(
     result: CellResult,
     key: CellKey,
     best_return: np.ndarray,
-    replay: Replay,
+    replay: Replay | None,
     pool: LearnersPool | None,
 ) -> pl.DataFrame:
     episodes, count = result.episodes, len(result.env_steps)
@@ -104,7 +104,6 @@ def _seeds(
     expert = np.full(count, -1) if pool is None else pool.expert[mine]
     finished = np.zeros(count, np.int32)
     np.maximum.at(finished, episodes.seed, episodes.episode.astype(np.int32))
-    difference = np.abs(replay.gymnasium_return - replay.jax_return).max(axis=1)
     return pl.DataFrame(
         {
             "seed": np.array(key.seed_range, np.int32),
@@ -120,8 +119,10 @@ def _seeds(
             "diverged": result.diverged,
             "best_evaluation": _best_evaluation(result),
             "best_return": best_return.astype(np.float32),
-            "gymnasium_return": replay.gymnasium_return.mean(axis=1),
-            "gymnasium_difference": difference,
+            "gymnasium_return": unknown if replay is None else replay.gymnasium_return.mean(axis=1),
+            "gymnasium_difference": unknown
+            if replay is None
+            else np.abs(replay.gymnasium_return - replay.jax_return).max(axis=1),
         }
     )
 

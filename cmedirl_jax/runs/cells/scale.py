@@ -1,0 +1,112 @@
+"""Where the returns of a task lie: from those of random actions to those of the best expert.
+
+A task whose specification has no `reward_threshold` counts as solved at `SOLVED` of the way. Both
+ends are measured on the evaluation starts. The spread of the rewards of single steps says how large
+a learned reward has to be to matter beside the task's own.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax.data import demonstrations as demonstrations_lib
+from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.envs import Env, Step
+from cmedirl_jax.runs.cells import recording
+from cmedirl_jax.training import evaluation
+
+SOLVED = 0.9
+"""The share of the way at which a task counts as solved."""
+ROUNDS = 10
+"""Random episodes from each evaluation start."""
+EPISODES = 100
+"""Random episodes from fresh starts, for the spread of a step's reward."""
+
+
+class Scale(NamedTuple):
+    """The returns of a task, undiscounted means over the evaluation starts, and its rewards.
+
+    Attributes:
+        random: return of actions that are drawn uniformly within their bounds.
+        expert: return of the best expert that demonstrates.
+        solved: the return that counts as solved: the task's own, where it has one.
+        reward_spread_random: standard deviation of a step's reward, over random episodes.
+        reward_spread_demonstrated: the same, over the demonstrations.
+    """
+
+    random: float
+    expert: float
+    solved: float
+    reward_spread_random: float
+    reward_spread_demonstrated: float
+
+
+def measure(env: Env, pool: Demonstrations, starts: int) -> Scale:
+    """The scale of a task by its demonstrations.
+
+    Args:
+        env: the task.
+        pool: whose metadata name the `expert_returns`; else the mean return of its episodes stands
+            for the best expert's.
+        starts: the number of evaluation starts.
+    """
+    returns = pool.metadata.get("expert_returns", [])
+    expert = float(max(returns, default=demonstrations_lib.returns(pool).mean()))
+    random = random_return(env, starts)
+    threshold = env.spec.reward_threshold
+    return Scale(
+        random=random,
+        expert=expert,
+        solved=solved(random, expert) if threshold is None else threshold,
+        reward_spread_random=_random_spread(env),
+        reward_spread_demonstrated=float(np.std(pool.transition.reward)),
+    )
+
+
+def solved(random: float, expert: float) -> float:
+    """The return at `SOLVED` of the way from random actions to the expert."""
+    return random + SOLVED * (expert - random)
+
+
+def random_return(env: Env, starts: int) -> float:
+    """The mean return of random actions from the evaluation starts."""
+    drawing, params = _drawing(env), env.default_params
+
+    @jax.jit
+    def run(key: jax.Array) -> jax.Array:
+        return evaluation.rollout(
+            lambda observations: jnp.zeros((starts, env.spec.action_dim)),
+            drawing,
+            params,
+            env.starts(starts, params),
+            key,
+        ).episode_return
+
+    return float(np.mean([run(key) for key in jax.random.split(jax.random.key(0), ROUNDS)]))
+
+
+def _random_spread(env: Env) -> float:
+    def act(actor: None, observations: jax.Array) -> jax.Array:
+        del actor
+        return jnp.zeros((*observations.shape[:-1], env.spec.action_dim))
+
+    record = jax.jit(lambda key: recording.record(act, _drawing(env), None, key, EPISODES))
+    transition, running, _ = jax.device_get(record(jax.random.key(1)))
+    return float(np.std(transition.reward[running]))
+
+
+def _drawing(env: Env) -> Env:
+    """The task, which draws an action of its own in place of the one that it is given."""
+    spec = env.spec
+
+    def step(key: jax.Array, state: Any, action: jax.Array, params: Any) -> tuple[Any, Step]:
+        del action
+        draw_key, step_key = jax.random.split(key)
+        drawn = jax.random.uniform(
+            draw_key, (spec.action_dim,), jnp.float32, spec.action_low, spec.action_high
+        )
+        return env.step(step_key, state, drawn, params)
+
+    return env._replace(step=step)
