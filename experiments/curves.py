@@ -14,6 +14,10 @@ from cmedirl_jax.training.methods import METHODS
 # which is faint on white.
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#882255", "#000000")
 STYLES = ("-", "--", "-.", ":")
+GREY = {"color": "0.6", "linestyle": "-"}
+"""The line of the method that others are drawn beside."""
+MOST_CURVES = 5
+"""More than these in one panel cannot be told apart: each method gets a panel of its own."""
 
 
 def band(axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, line: dict[str, Any]) -> None:
@@ -35,12 +39,11 @@ def band(axes: Axes, rows: pl.DataFrame, x: str, y: str, method: str, line: dict
     )
     if not len(bands):
         return
-    label = METHODS[method].label or method
     if len(bands) == 1:
         # A method that never interacts has the same return at every step.
-        axes.axhline(bands[0, 0], color=line["color"], linestyle="-.", label=label)
+        axes.axhline(bands[0, 0], color=line["color"], linestyle="-.", label=label(method))
         return
-    axes.plot(points[x], bands[:, 0], **line, label=label)
+    axes.plot(points[x], bands[:, 0], **line, label=label(method))
     axes.fill_between(
         points[x], bands[:, 1], bands[:, 2], color=line["color"], alpha=0.2, linewidth=0
     )
@@ -54,10 +57,36 @@ def levels(axes: Axes, expert: float | None, threshold: float | None) -> None:
         axes.axhline(threshold, color="0.7", linestyle=":", linewidth=1, label="solved")
 
 
-def legend(figure: Figure, axes: Axes) -> None:
-    """One legend for the figure, below it, where it hides nothing."""
+def panels(methods: Iterable[str]) -> tuple[Figure, dict[str, Axes]]:
+    """A figure with a titled panel for each method, with shared axes."""
+    methods = list(methods)
+    columns = 4
+    rows = -(-len(methods) // columns)
+    figure = Figure(figsize=(11, 2.4 * rows), layout="constrained")
+    every = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
+    for axes in every[len(methods) :]:
+        axes.set_axis_off()
+    found = dict(zip(methods, every, strict=False))
+    for method, axes in found.items():
+        axes.set_title(label(method), fontsize=10)
+    return figure, found
+
+
+def label(method: str) -> str:
+    """What a method is called in figures."""
+    return METHODS[method].label or method
+
+
+def legend(figure: Figure, axes: Axes, columns: int = 3) -> None:
+    """One legend for the figure, below it, where it hides nothing.
+
+    Args:
+        figure: the figure.
+        axes: whose curves it names.
+        columns: at most so many for each panel of the figure.
+    """
     handles, labels = axes.get_legend_handles_labels()
-    columns = min(len(labels), 3 * len(figure.axes))
+    columns = min(len(labels), columns * len(figure.axes))
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
 
 

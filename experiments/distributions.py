@@ -1,6 +1,6 @@
 """Figures of how the seeds of each method spread: when they arrive, and how far they get."""
 
-from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -8,7 +8,6 @@ import polars as pl
 from cmedirl_jax.runs import intervals, statistics
 from cmedirl_jax.runs.drawing import Axes, Figure
 from cmedirl_jax.runs.statistics import SeedStatistics
-from cmedirl_jax.training.methods import METHODS
 from experiments import curves
 
 
@@ -20,33 +19,76 @@ def survival(found: dict[str, SeedStatistics], last: float, by_episodes: bool) -
         last: the step, or episode, at which all seeds end.
         by_episodes: whether the seeds all end at one episode, rather than at one step.
     """
-    figure = Figure(figsize=(6.5, 4.3), layout="constrained")
-    axes = figure.subplots()
+    unit = "episodes" if by_episodes else "environment steps"
     arrivals = {
         method: one.convergence_episode if by_episodes else one.convergence_env_step
         for method, one in found.items()
     }
-    lines = curves.lines(found)
     first = next(iter(arrivals), "")
-    for method, times in arrivals.items():
-        left = intervals.survival(times)
-        at = np.r_[0.0, left.time, last]
-        share, low, high = (np.r_[1.0, x, x[-1]] for x in (left.share, left.low, left.high))
-        label = METHODS[method].label or method
-        if method != first:
-            p_value = intervals.logrank(times, arrivals[first])
-            label += ", p < 0.001" if p_value < 0.001 else f", p = {p_value:.3f}"
-        line = lines[method]
-        axes.step(at, share, where="post", **line, label=label)
-        axes.fill_between(at, low, high, step="post", color=line["color"], alpha=0.15, linewidth=0)
-    unit = "episodes" if by_episodes else "environment steps"
-    axes.set(xlabel=unit, ylabel="share of seeds not solved yet", ylim=(-0.02, 1.02))
-    curves.legend(figure, axes)
+    labels = {
+        method: curves.label(method) + ("" if method == first else _p_value(times, arrivals[first]))
+        for method, times in arrivals.items()
+    }
+    steps = {method: _left(times, last) for method, times in arrivals.items()}
+    figure = _steps(steps, labels, unit, "share of seeds not solved yet")
     title = "Kaplan-Meier curves, with pointwise 95% intervals"
     if len(arrivals) > 1:
-        title += f"\np: log-rank test against {METHODS[first].label or first}, ignores pairing"
+        title += f"\np: log-rank test against {curves.label(first)}, ignores pairing"
     figure.suptitle(title, fontsize=10)
     return figure
+
+
+class _Steps(NamedTuple):
+    """A step function with its band, arrays `[points]`."""
+
+    at: np.ndarray
+    share: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def _left(times: np.ndarray, last: float) -> _Steps:
+    left = intervals.survival(times)
+    return _Steps(
+        np.r_[0.0, left.time, last],
+        *(np.r_[1.0, x, x[-1]] for x in (left.share, left.low, left.high)),
+    )
+
+
+def _p_value(times: np.ndarray, reference: np.ndarray) -> str:
+    found = intervals.logrank(times, reference)
+    return ", p < 0.001" if found < 0.001 else f", p = {found:.3f}"
+
+
+def _steps(steps: dict[str, _Steps], labels: dict[str, str], xlabel: str, ylabel: str) -> Figure:
+    """Step functions in one panel, or in a panel each beside the first one."""
+    lines = curves.lines(steps)
+    first = next(iter(steps), "")
+    if len(steps) <= curves.MOST_CURVES:
+        figure = Figure(figsize=(6.5, 4.3), layout="constrained")
+        axes = figure.subplots()
+        for method, one in steps.items():
+            _draw(axes, one, lines[method], labels[method])
+        axes.set(xlabel=xlabel, ylabel=ylabel, ylim=(-0.02, 1.02))
+        curves.legend(figure, axes, columns=2)
+        return figure
+    figure, panels = curves.panels(steps)
+    for method, axes in panels.items():
+        if method != first:
+            _draw(axes, steps[first], curves.GREY, labels[first])
+        _draw(axes, steps[method], lines[method] | {"linestyle": "-"}, labels[method])
+        axes.set_title(labels[method], fontsize=10)
+        axes.set(ylim=(-0.02, 1.02))
+    figure.supxlabel(xlabel, fontsize=10)
+    figure.supylabel(ylabel, fontsize=10)
+    return figure
+
+
+def _draw(axes: Axes, steps: _Steps, line: dict[str, Any], label: str) -> None:
+    axes.step(steps.at, steps.share, where="post", **line, label=label)
+    axes.fill_between(
+        steps.at, steps.low, steps.high, step="post", color=line["color"], alpha=0.15, linewidth=0
+    )
 
 
 def profile(found: dict[str, SeedStatistics]) -> Figure:
@@ -55,33 +97,17 @@ def profile(found: dict[str, SeedStatistics]) -> Figure:
     Args:
         found: statistics of each method's seeds.
     """
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    lines = curves.lines(found)
-    scores: tuple[tuple[Axes, str, Callable[[SeedStatistics], np.ndarray]], ...] = (
-        (left, "mean return of all evaluations", lambda one: one.area),
-        (right, "return of the last evaluation", lambda one: one.final_return),
+    values = {method: np.sort(one.area) for method, one in found.items()}
+    ends = np.concatenate([[], *values.values()])
+    steps = {}
+    for method, one in values.items():
+        at = np.r_[ends.min() - 1.0, one, ends.max()]
+        bounds = np.array([intervals.share(one > score) for score in at])
+        steps[method] = _Steps(at, *bounds.T)
+    labels = {method: curves.label(method) for method in values}
+    figure = _steps(
+        steps, labels, "mean return of all evaluations", "share of seeds that return more"
     )
-    for axes, title, of in scores:
-        values = {method: np.sort(of(one)) for method, one in found.items()}
-        ends = np.concatenate([[], *values.values()])
-        for method, one in values.items():
-            at = np.r_[ends.min() - 1.0, one, ends.max()]
-            bounds = np.array([intervals.share(one > score) for score in at])
-            line = lines[method] | {"label": METHODS[method].label or method}
-            axes.step(at, bounds[:, 0], where="post", **line)
-            axes.fill_between(
-                at,
-                bounds[:, 1],
-                bounds[:, 2],
-                step="post",
-                color=line["color"],
-                alpha=0.15,
-                linewidth=0,
-            )
-        axes.set(xlabel=title)
-    left.set(ylabel="share of seeds that return more", ylim=(-0.02, 1.02))
-    curves.legend(figure, left)
     figure.suptitle("Performance profiles, with pointwise 95% intervals", fontsize=10)
     return figure
 

@@ -9,12 +9,8 @@ import polars as pl
 from cmedirl_jax.runs import drawing, intervals, statistics
 from cmedirl_jax.runs.console import streams
 from cmedirl_jax.runs.drawing import Axes, Figure
-from cmedirl_jax.training.methods import METHODS
 from experiments import curves, distributions
 from experiments.curves import Over
-
-MOST_CURVES = 5
-"""More than these in one panel cannot be told apart: each method gets a panel of its own."""
 
 
 def draw(
@@ -87,7 +83,7 @@ def average_return(
     With many methods a panel for each, of the noise-free return.
     """
     table = evaluations.rows
-    if table["method"].n_unique() > MOST_CURVES:
+    if table["method"].n_unique() > curves.MOST_CURVES:
         return _panels(evaluations, expert, threshold)
     figure = Figure(figsize=(10, 4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -127,29 +123,22 @@ def average_return(
 
 def _panels(evaluations: Over, expert: float | None, threshold: float) -> Figure:
     """Noise-free return, a panel for each method beside the first one."""
-    table, column, label = evaluations
+    table, column, unit = evaluations
     lines = curves.lines(table["method"])
-    columns = 4
-    rows = -(-len(lines) // columns)
-    figure = Figure(figsize=(11, 2.4 * rows), layout="constrained")
-    panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
+    figure, panels = curves.panels(lines)
     first = next(iter(lines))
-    for method, axes in zip(lines, panels, strict=False):
+    for method, axes in panels.items():
         if method != first:
-            grey = {"color": "0.6", "linestyle": "-"}
             reference = table.filter(pl.col("method") == first)
-            curves.band(axes, reference, column, "return_mean", first, grey)
+            curves.band(axes, reference, column, "return_mean", first, curves.GREY)
         one = table.filter(pl.col("method") == method)
         curves.band(axes, one, column, "return_mean", method, lines[method] | {"linestyle": "-"})
         curves.levels(axes, expert, threshold)
-        axes.set_title(METHODS[method].label or method, fontsize=10)
-    for axes in panels[len(lines) :]:
-        axes.set_axis_off()
-    figure.supxlabel(label, fontsize=10)
+    figure.supxlabel(unit, fontsize=10)
     figure.supylabel("average return without noise", fontsize=10)
     figure.suptitle(
         f"Mean over {table['seed'].n_unique()} seeds and its 95% interval; grey: "
-        f"{METHODS[first].label or first}; dashed: experts; dotted: solved",
+        f"{curves.label(first)}; dashed: experts; dotted: solved",
         fontsize=10,
     )
     return figure
@@ -183,7 +172,7 @@ def cost(evaluations: pl.DataFrame, seeds: pl.DataFrame, threshold: float) -> Fi
         total = rows.with_columns(env_step=pl.col("env_step") + before)
         if rows["env_step"].max() == 0:
             mean, at = intervals.mean(rows["return_mean"].to_numpy()).estimate, before
-            axes.plot([at], [mean], "o", color=line["color"], label=METHODS[method].label or method)
+            axes.plot([at], [mean], "o", color=line["color"], label=curves.label(method))
             continue
         curves.band(axes, total, "env_step", "return_mean", method, line)
     curves.levels(axes, None, threshold)
@@ -233,7 +222,7 @@ def _over_demonstrations(axes: Axes, summary: pl.DataFrame, column: str) -> None
         low, middle, high = (
             rows[column + end].cast(pl.Float64).to_numpy() for end in ("_low", "", "_high")
         )
-        label = METHODS[method].label or method
+        label = curves.label(method)
         if np.isnan(middle).all():
             continue
         if rows["n_demos"].max() == 0:
