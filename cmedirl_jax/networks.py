@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks, modes, products, ranges
+from cmedirl_jax import checks, modes, normalisation, products, ranges
+from cmedirl_jax.normalisation import Normalise
 from cmedirl_jax.ranges import Count, NotNegative, Size
 from cmedirl_jax.types import EnvSpec, Network, Params
 
@@ -48,7 +49,10 @@ class Architecture:
         hidden: Units of each hidden layer, of the actor and of the critic.
         actor_normalisation: Normalisation of the actor's hidden layers, before each ReLU.
         critic_normalisation: Normalisation of the critic's hidden layers, before each ReLU.
-        normalise_observation: Map the observation bounds to [-1, 1] at the input of each network.
+        normalise_observation: At the input of each network, the reward's too. bounds: map them to
+            [-1, 1] where they are sensible, elsewhere take off the mean of the demonstrations'
+            observations (of one's own so far, where there are none) and divide by their standard
+            deviation; statistics: do this everywhere; none.
         action_layer: Index of the critic's layer at which the action joins (0: the input;
             Lillicrap et al.: 1).
         output_scale: Half-width of the uniform initialisation of the last layer's parameters.
@@ -57,7 +61,7 @@ class Architecture:
     hidden: tuple[Size, ...] = (64, 64)
     actor_normalisation: Normalisation = "none"
     critic_normalisation: Normalisation = "layer"
-    normalise_observation: bool = True
+    normalise_observation: Normalise = "bounds"
     action_layer: Count = 0
     output_scale: NotNegative = 3e-3
 
@@ -110,10 +114,12 @@ def actor(spec: EnvSpec, architecture: Architecture) -> Network:
         normalisation=architecture.actor_normalisation,
         output_scale=architecture.output_scale,
     )
-    scale = observation_scaling(spec) if architecture.normalise_observation else _identity
+    scale = normalisation.make(spec, architecture.normalise_observation)
     return from_module(
-        lambda variables, observation, **kwargs: mlp.apply(variables, scale(observation), **kwargs),
-        lambda key: mlp.init(key, jnp.zeros((1, spec.observation_dim))),
+        lambda variables, observation, **kwargs: mlp.apply(
+            variables, scale(variables, observation), **kwargs
+        ),
+        lambda key: mlp.init(key, jnp.zeros((1, spec.observation_dim))) | scale.initial(),
     )
 
 
@@ -131,13 +137,14 @@ def critic(spec: EnvSpec, architecture: Architecture) -> Network:
         join=architecture.action_layer,
         output_scale=architecture.output_scale,
     )
-    scale = observation_scaling(spec) if architecture.normalise_observation else _identity
+    scale = normalisation.make(spec, architecture.normalise_observation)
     network = from_module(
         lambda variables, observation, action, **kwargs: mlp.apply(
-            variables, scale(observation), action, **kwargs
+            variables, scale(variables, observation), action, **kwargs
         ),
-        lambda key: mlp.init(
-            key, jnp.zeros((1, spec.observation_dim)), jnp.zeros((1, spec.action_dim))
+        lambda key: (
+            mlp.init(key, jnp.zeros((1, spec.observation_dim)), jnp.zeros((1, spec.action_dim)))
+            | scale.initial()
         ),
     )
     return scalar_output(network)
@@ -201,31 +208,6 @@ def _squash(centre: jax.Array, half_width: jax.Array, pre_activation: jax.Array)
     return centre + half_width * jnp.tanh(pre_activation)
 
 
-def observation_scaling(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
-    """The affine map from `spec`'s observation bounds to [-1, 1]: `[..., O]` -> `[..., O]`.
-
-    The map raises ValueError for another last axis, and TypeError for arrays that are not floats.
-
-    Raises:
-        ValueError: if the specification contradicts itself, or a bound is infinite.
-    """
-    checks.env_spec(spec)
-    if not (np.isfinite(spec.observation_low).all() and np.isfinite(spec.observation_high).all()):
-        raise ValueError(
-            f"{spec.id}: observations can only be normalised by finite bounds, "
-            f"got {spec.observation_low} and {spec.observation_high}"
-        )
-    centre = 0.5 * (spec.observation_high + spec.observation_low)
-    half_width = 0.5 * (spec.observation_high - spec.observation_low)
-    return functools.partial(_scale, centre, half_width)
-
-
-def _scale(centre: np.ndarray, half_width: np.ndarray, observation: jax.Array) -> jax.Array:
-    checks.vectors("observation", observation, len(centre))
-    aligned, middle, scale = modes.align(observation, centre, half_width)
-    return (aligned - middle) / scale
-
-
 def from_module(apply: Callable[..., Any], init: Callable[[jax.Array], Params]) -> Network:
     """Wrap a Linen `apply` (which takes `train=` and `mutable=`) and `init` as a `Network`.
 
@@ -275,7 +257,3 @@ def _dense(units: int, bound: float) -> nn.Dense:
         bias_init=initialise,
         dot_general=products.dot_general,
     )
-
-
-def _identity(observation: jax.Array) -> jax.Array:
-    return observation

@@ -9,6 +9,7 @@ from cmedirl_jax.irl import IRLHParams
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
 from cmedirl_jax.runs.config import ExpertSettings, StudyConfig
 from cmedirl_jax.tabular.imitation import TabularSettings
+from cmedirl_jax.training import tasks
 from cmedirl_jax.training.schedules import RewardSchedule, Schedule
 from cmedirl_jax.training.settings import Settings
 
@@ -31,6 +32,8 @@ _PAPER_SETTINGS = Settings(
     schedule=Schedule(recent=10_000, learning_starts=0, target_period=300, cloning="none"),
 )
 
+CAR = StudyConfig().env
+"""The paper's task."""
 SWEEP = (1, 5, 10, 50, 100, 200)
 """The numbers of demonstrations N_T of the full grid."""
 
@@ -57,10 +60,24 @@ PRESETS: dict[str, StudyConfig] = {
 }
 
 
-def preset(name: str, grid: str = "main") -> StudyConfig:
-    """The configuration of a preset, on one of the two grids; `tuned` for an unknown name."""
+def preset(name: str, grid: str = "main", env: str = CAR) -> StudyConfig:
+    """The configuration of a preset, on one of the two grids; `tuned` for an unknown name.
+
+    Other tasks have settings of their own under `tuned`, see `training.tasks`; `smoke` and `paper`
+    are as they are on the car.
+    """
     config = PRESETS.get(name, PRESETS["tuned"])
+    if env != CAR:
+        task = tasks.of(env)
+        config = dataclasses.replace(config, env=env)
+        if config.preset == "tuned":
+            experts = dataclasses.replace(config.experts, steps=task.expert_steps)
+            config = dataclasses.replace(
+                config, settings=task.settings, max_steps=task.steps, experts=experts
+            )
     if grid != "full":
         return config
-    steps = 20_000 if config.preset == "tuned" else config.max_steps
+    steps = config.max_steps
+    if config.preset == "tuned" and steps is not None:
+        steps = max(20_000, steps)
     return dataclasses.replace(config, grid="full", n_demos=SWEEP, max_steps=steps)

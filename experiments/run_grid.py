@@ -102,16 +102,17 @@ def parse(arguments: Sequence[str]) -> StudyConfig:
         StudyConfig,
         prog="python -m experiments.run_grid",
         description=__doc__,
-        default=presets.preset(first.preset, first.grid),
+        default=presets.preset(first.preset, first.grid, first.env),
         args=list(arguments),
     )
 
 
 def _read_first(arguments: Sequence[str]) -> argparse.Namespace:
-    # The preset decides every other default, which tyro needs; it reports a wrong one.
+    # These decide every other default, which tyro needs; it reports a wrong one.
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--preset", default="tuned")
     parser.add_argument("--grid", default="main")
+    parser.add_argument("--env", default=presets.CAR)
     # A default number of demonstrations is no more than a file holds; a number given is meant.
     parser.add_argument("--n-demos", "--n_demos", nargs="*")
     return parser.parse_known_args(list(arguments))[0]

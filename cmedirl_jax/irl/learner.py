@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cmedirl_jax import checks, modes, optimizers, ranges
+from cmedirl_jax import checks, modes, normalisation, optimizers, ranges
 from cmedirl_jax.irl import base, objectives, regularisers, rewards
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.irl.objectives import OBJECTIVES, Likelihood, ObjectiveName
@@ -212,7 +212,7 @@ def _update(
     if hparams.gauge != "none":
         target = regularisers.gauge_offset(hparams.gauge, *scored)
         offset += (hparams.gauge_rate * (target - offset)).astype(offset.dtype)
-    network, absorbing = cast(Any, optax.apply_updates(learned, updates))
+    network, absorbing = cast(Any, optax.apply_updates(learned, normalisation.fixed(updates)))
     params = RewardParams(network, offset, absorbing)
     return state.replace(params=params, optimizer=optimizer_state), info
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from cmedirl_jax import normalisation
 from cmedirl_jax.types import Numeric, Params
 
 BoundKind = Literal["tanh", "clip", "none"]
@@ -19,8 +20,11 @@ Gauge = Literal["none", "zero-mean", "demonstration-maximum"]
 
 
 def log_prior(params: Params, precision: Numeric) -> jax.Array:
-    """log P(theta) = -precision / 2 ||theta||^2 up to its constant (Eq. 4), `[]`."""
-    return -0.5 * precision * optax.tree.norm(params, squared=True)
+    """log P(theta) = -precision / 2 ||theta||^2 up to its constant (Eq. 4), `[]`.
+
+    Statistics among the parameters do not count.
+    """
+    return -0.5 * precision * optax.tree.norm(normalisation.trained(params), squared=True)
 
 
 def output_penalty(output: jax.Array, mask: jax.Array) -> jax.Array:

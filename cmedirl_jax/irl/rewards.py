@@ -19,7 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks, grids, modes, networks
+from cmedirl_jax import checks, grids, modes, networks, normalisation
+from cmedirl_jax.normalisation import Normalise
 from cmedirl_jax.ranges import AtLeastTwo, Size
 from cmedirl_jax.registries import Registry
 from cmedirl_jax.types import Array, EnvSpec, Network, Params
@@ -61,17 +62,22 @@ class NetworkKind(NamedTuple):
     """All that belongs to the name of a kind of reward network.
 
     Attributes:
-        make: `(spec, settings, inputs) -> Network`; of the settings it reads its own fields.
+        make: `(spec, settings, inputs, normalise) -> Network`; of the settings it reads its own
+            fields.
         starts_at_zero: whether its first parameters give r_D = 0 everywhere, so that it cannot be
             the network of a random reward.
     """
 
-    make: Callable[[EnvSpec, RewardNetworkSettings, Inputs], Network]
+    make: Callable[[EnvSpec, RewardNetworkSettings, Inputs, Normalise], Network]
     starts_at_zero: bool = False
 
 
 def make(
-    spec: EnvSpec, settings: RewardNetworkSettings | None = None, *, state_only: bool = False
+    spec: EnvSpec,
+    settings: RewardNetworkSettings | None = None,
+    *,
+    state_only: bool = False,
+    normalise: Normalise = "bounds",
 ) -> Network:
     """The network that `settings.kind` names, before any bound.
 
@@ -79,28 +85,32 @@ def make(
         spec: the environment's sizes and bounds.
         settings: the kind, and its sizes.
         state_only: make r(s), as a potential needs, whatever `settings.inputs` says.
+        normalise: how a deep reward normalises observations; the others need bounds.
 
     Raises:
         ValueError: for an unknown kind, or one that needs finite bounds that `spec` lacks.
     """
     settings = settings or RewardNetworkSettings()
     inputs = "state" if state_only else settings.inputs
-    return NETWORKS[settings.kind].make(spec, settings, inputs)
+    return NETWORKS[settings.kind].make(spec, settings, inputs, normalise)
 
 
 def mlp(
-    spec: EnvSpec, hidden: tuple[int, ...] = (64, 64), inputs: Inputs = "state-action"
+    spec: EnvSpec,
+    hidden: tuple[int, ...] = (64, 64),
+    inputs: Inputs = "state-action",
+    normalise: Normalise = "bounds",
 ) -> Network:
     """A deep reward: observation `[..., O]`, action `[..., A]` -> `[...]`, before any bound.
 
-    It is the critic's network without normalisation: the observation is scaled to [-1, 1], and the
-    action joins at the input. With inputs "state" it is the actor's network with one output.
-
-    Raises:
-        ValueError: if the observation has an infinite bound.
+    It is the critic's network without normalisation of its layers: the observation is normalised as
+    `normalise` says, and the action joins at the input. With inputs "state" it is the actor's
+    network with one output.
     """
     checks.env_spec(spec)
-    architecture = networks.Architecture(hidden=hidden, critic_normalisation="none")
+    architecture = networks.Architecture(
+        hidden=hidden, critic_normalisation="none", normalise_observation=normalise
+    )
     if inputs == "state-action":
         network = networks.critic(spec, architecture)
         return network._replace(apply=functools.partial(_apply_to_pairs, spec, network))
@@ -155,7 +165,7 @@ def radial_basis(spec: EnvSpec, centres: int, inputs: Inputs = "state-action") -
     checks.env_spec(spec)
     if centres < 2:
         raise ValueError(f"radial basis functions need two centres or more, got {centres}")
-    scale, dims = networks.observation_scaling(spec), spec.observation_dim
+    scale, dims = normalisation.by_bounds(spec), spec.observation_dim
     checks.array_size("radial basis functions", (*[centres] * dims, dims), _FEWER_CENTRES)
     axis = np.linspace(-1.0, 1.0, centres)
     grid = grids.product(*[axis] * dims)
@@ -203,8 +213,7 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
     low, high = spec.observation_low, spec.observation_high
     if inputs == "state-action":
         low, high = np.append(low, spec.action_low), np.append(high, spec.action_high)
-    if not np.isfinite([low, high]).all():
-        raise ValueError(f"{spec.id}: a Fourier basis needs finite bounds, got {low} and {high}")
+    normalisation.by_bounds(spec)
     checks.array_size("a Fourier basis", (*[order + 1] * len(low), len(low)), _LOWER_ORDER)
     frequencies = np.pi * grids.product(*[np.arange(order + 1.0)] * len(low))
     return functools.partial(_fourier, spec, inputs, low, high, frequencies.astype(np.float32))
@@ -232,15 +241,19 @@ def _fourier(
 NETWORKS: Registry[NetworkKind] = Registry(
     "kind of reward network",
     {
-        "deep": NetworkKind(lambda spec, settings, inputs: mlp(spec, settings.hidden, inputs)),
+        "deep": NetworkKind(
+            lambda spec, settings, inputs, normalise: mlp(spec, settings.hidden, inputs, normalise)
+        ),
         "radial-basis": NetworkKind(
-            lambda spec, settings, inputs: linear(
+            lambda spec, settings, inputs, normalise: linear(
                 spec, radial_basis(spec, settings.centres, inputs)
             ),
             starts_at_zero=True,
         ),
         "fourier": NetworkKind(
-            lambda spec, settings, inputs: linear(spec, fourier(spec, settings.order, inputs)),
+            lambda spec, settings, inputs, normalise: linear(
+                spec, fourier(spec, settings.order, inputs)
+            ),
             starts_at_zero=True,
         ),
     },

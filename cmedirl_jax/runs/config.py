@@ -81,7 +81,7 @@ class StudyConfig:
             the task can be set to an observation; spec: the task's name and bounds, and that steps
             follow each other, for tasks that draw random numbers; none: the task's sizes, for
             noisy demonstrations or those of another task.
-        env: The environment, by Gymnasium's name.
+        env: The task, by its name; under tuned it brings settings of its own, where it has some.
         devices: CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU.
             With several processes, of each of them.
         group: Seeds that a device steps together; default: what is fastest for the networks' width.

@@ -30,7 +30,7 @@ from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage.cells import CellKey
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.runs.validation import Plan
-from cmedirl_jax.training import seeds
+from cmedirl_jax.training import seeds, tasks
 from cmedirl_jax.training.methods import METHODS, Method
 from cmedirl_jax.training.settings import Settings
 
@@ -201,7 +201,7 @@ def _train_experts(
         session.keys.experts,
         plan.env,
         plan.experts,
-        session.compiled(METHODS["ddpg"], Settings(), plan.seeds),
+        session.compiled(METHODS["ddpg"], tasks.of(plan.env.spec.id).experts, plan.seeds),
         plan.budget.evaluation_starts,
         _stepwise(report, plan.experts.seeds),
         checkpointer,

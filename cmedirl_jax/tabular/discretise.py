@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, normalisation
 from cmedirl_jax import grids as grids_lib
 from cmedirl_jax.envs import Env, Step
 from cmedirl_jax.tabular import interpolation
@@ -192,7 +192,7 @@ def grids(
         ValueError: if a bound is infinite, or the shapes do not have the specification's sizes.
     """
 
-    checks.env_spec(spec)
+    normalisation.by_bounds(spec)
 
     def over(low: np.ndarray, high: np.ndarray, shape: Sequence[int]) -> Grid:
         return Grid(tuple(map(float, low)), tuple(map(float, high)), tuple(shape))

@@ -62,7 +62,12 @@ def compose(spec: EnvSpec, method: Method, settings: Settings, capacity: int) ->
 
     learner, sampler, draws = None, None, False
     if source is not None:
-        network = rewards.make(spec, settings.reward_network, state_only=shaping == "potential")
+        network = rewards.make(
+            spec,
+            settings.reward_network,
+            state_only=shaping == "potential",
+            normalise=settings.architecture.normalise_observation,
+        )
         learner = source.make(spec, settings, network)
     if source is not None and source.sampling is not None:
         batches, objective, append, draws = source.sampling(settings)

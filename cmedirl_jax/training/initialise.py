@@ -2,13 +2,13 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import modes
+from cmedirl_jax import modes, normalisation
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.agents.ddpg import DDPGState
 from cmedirl_jax.agents.hot_start import HotStartData
@@ -22,6 +22,11 @@ from cmedirl_jax.training.compose import Algorithm
 from cmedirl_jax.training.methods import Method
 from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.types import Numeric, Params
+
+Tree = TypeVar("Tree")
+
+STATISTICS_SAMPLE = 4_096
+"""Demonstrated steps that observations are normalised by, where their bounds do not do it."""
 
 
 class TrainingState(flax.struct.PyTreeNode):
@@ -40,8 +45,8 @@ class TrainingState(flax.struct.PyTreeNode):
         episode_return: `[]`, of the running episode.
         episode_length: `[]` int32, of the running episode.
         subset: the seed's own demonstrations, or None.
-        observation_statistics: running statistics that normalise observations; None where they
-            are normalised by their bounds.
+        observation_statistics: running statistics of the observations so far, which normalise them;
+            None where their bounds do, or the demonstrations' statistics.
     """
 
     key: jax.Array
@@ -56,7 +61,7 @@ class TrainingState(flax.struct.PyTreeNode):
     episode_return: jax.Array
     episode_length: jax.Array
     subset: DemonstrationSubset | None
-    observation_statistics: Any = None
+    observation_statistics: normalisation.Running | None = None
 
 
 class Initialisation(NamedTuple):
@@ -145,6 +150,7 @@ def _hot_start(
         return networks
     keys, _ = split(jax.random.clone(key))
     data, subset = _demonstrations(parts, keys, data, n_demonstrations)
+    networks = _with_statistics(keys, data, subset, networks)
     return hot_start.fit(
         keys.hot_start,
         parts.algorithm.agent.networks,
@@ -170,6 +176,19 @@ def _demonstrations(
     )
 
 
+def _with_statistics(
+    keys: SeedKeys, data: HotStartData, subset: DemonstrationSubset, params: Tree
+) -> Tree:
+    """Give networks that keep statistics those of a sample of the demonstrations."""
+    if not normalisation.kept(params):
+        return params
+    rows = demonstrations_lib.sample_index(
+        jax.random.fold_in(keys.subset, 0), subset, STATISTICS_SAMPLE
+    )
+    observations = jnp.asarray(data.transition.observation)[rows]
+    return normalisation.put(params, normalisation.of_sample(observations))
+
+
 def _init(
     parts: _Parts,
     key: jax.Array,
@@ -188,6 +207,10 @@ def _init(
     # What the demonstrations give: a tabular reward, the sampler's fitted Gaussian.
     if parts.method.uses_demonstrations:
         data, subset = _demonstrations(parts, keys, data, n_demonstrations)
+        networks = _with_statistics(keys, data, subset, networks)
+        if reward is not None:
+            params = _with_statistics(keys, data, subset, reward.params)
+            reward = reward.replace(params=params)
         if parts.method.tabular is not None:
             reward = _fit_table(parts, keys, data, subset)
         if algorithm.sampler is not None:
@@ -197,6 +220,9 @@ def _init(
 
     # The first episode.
     env_state, observation = parts.env.reset(keys.env, parts.env_params)
+    running = None
+    if normalisation.kept(networks) and not parts.method.uses_demonstrations:
+        running = normalisation.begin(observation)
     state = TrainingState(
         key=steps_key,
         agent=algorithm.agent.init(keys.agent, networks),
@@ -210,6 +236,7 @@ def _init(
         episode_return=jnp.zeros((), jnp.float32),
         episode_length=jnp.zeros((), jnp.int32),
         subset=subset,
+        observation_statistics=running,
     )
     return modes.vary(state, key)
 

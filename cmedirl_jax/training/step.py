@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import modes
+from cmedirl_jax import modes, normalisation
 from cmedirl_jax.agents.ddpg import DDPGState
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.data.replay import ReplayState
@@ -150,6 +150,7 @@ def learn(
 
     # Learn the agent.
     agent, losses = _learn_agent(parts, state.agent, reward, replay_state, draws, plan, pool)
+    agent, reward, statistics = _move_statistics(state, answer, agent, reward)
     losses = losses._replace(added=losses.added or stored)
     done = ended
     if max_episodes is not None:
@@ -159,7 +160,13 @@ def learn(
 
     # Log, and go on.
     log = _log(state, answer, done, plan, losses, reward_info)
-    state = state.replace(agent=agent, reward=reward, storage=replay_state.storage, sampler=sampler)
+    state = state.replace(
+        agent=agent,
+        reward=reward,
+        storage=replay_state.storage,
+        sampler=sampler,
+        observation_statistics=statistics,
+    )
     return _next_episode(parts, state, behaviour, answer, next_start, ended, log), log
 
 
@@ -244,6 +251,26 @@ def _learn_agent(
     here = reward is not None and not parts.updates.stores_shaped
     none = _Losses(zero, zero, Added(zero, zero) if here else None)
     return jax.lax.cond(plan.learn, update, lambda agent: (agent, none), agent)
+
+
+def _move_statistics(
+    state: TrainingState, answer: Step, agent: DDPGState, reward: RewardState | None
+) -> tuple[DDPGState, RewardState | None, normalisation.Running | None]:
+    """Add the new observation to the running statistics, and give them to every network."""
+    running = state.observation_statistics
+    if running is None:
+        return agent, reward, None
+    running = normalisation.add(running, answer.observation)
+    statistics = normalisation.of_running(running)
+    agent = agent.replace(
+        **{
+            name: normalisation.put(getattr(agent, name), statistics)
+            for name in ("actor", "critic", "target_actor", "target_critic")
+        }
+    )
+    if reward is not None:
+        reward = reward.replace(params=normalisation.put(reward.params, statistics))
+    return agent, reward, running
 
 
 def _keep_parameters(

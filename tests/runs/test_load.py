@@ -75,7 +75,7 @@ VARIANTS = {
     "a constant": ("ddpg-minus-constant", {"reward": {"bound": 0.2}}),
     "another architecture": (
         "me-ddpg",
-        {"architecture": {"hidden": (4,), "normalise_observation": False}},
+        {"architecture": {"hidden": (4,), "normalise_observation": "none"}},
     ),
     "other normalisation": (
         "me-ddpg",

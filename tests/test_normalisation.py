@@ -1,0 +1,146 @@
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from cmedirl_jax import networks, normalisation
+from cmedirl_jax.agents import ddpg
+from cmedirl_jax.irl import regularisers, rewards
+from cmedirl_jax.networks import Architecture
+from cmedirl_jax.normalisation import STATISTICS, Statistics
+from cmedirl_jax.types import Transition
+
+KEY = jax.random.key(0)
+
+
+@pytest.fixture
+def unbounded(skewed_spec):
+    """The first observation has sensible bounds, the others have none."""
+    return skewed_spec._replace(
+        observation_low=np.array([skewed_spec.observation_low[0], -np.inf, -3.4e38], np.float32),
+        observation_high=np.array([skewed_spec.observation_high[0], 1e30, 3.4e38], np.float32),
+    )
+
+
+def test_bounds_map_to_one_and_need_no_statistics(skewed_spec):
+    made = normalisation.make(skewed_spec, "bounds")
+    low, high = skewed_spec.observation_low, skewed_spec.observation_high
+    assert made.initial() == {}
+    for scale in (lambda observation: made({}, observation), normalisation.by_bounds(skewed_spec)):
+        np.testing.assert_allclose(scale(low), [-1, -1, -1], rtol=1e-6)
+        np.testing.assert_allclose(scale(high), [1, 1, 1], rtol=1e-6)
+        np.testing.assert_allclose(scale((low + high) / 2), [0, 0, 0], atol=1e-6)
+
+
+def test_senseless_bounds_give_way_to_statistics_one_by_one(unbounded):
+    made = normalisation.make(unbounded, "bounds")
+    np.testing.assert_array_equal(made.by_statistics, [False, True, True])
+    variables = {
+        STATISTICS: {"mean": jnp.array([9.0, 1.0, -2.0]), "std": jnp.array([9.0, 2.0, 4.0])}
+    }
+    high = unbounded.observation_high[0]
+    found = made(variables, jnp.array([high, 5.0, -10.0]))
+    np.testing.assert_allclose(found, [1.0, 2.0, -2.0], rtol=1e-6)
+    # Far out it is clipped.
+    assert made(variables, jnp.array([high, 1e9, 0.0]))[1] == normalisation.CLIP
+
+
+def test_statistics_everywhere_or_nothing_at_all(skewed_spec):
+    everywhere = normalisation.make(skewed_spec, "statistics")
+    assert everywhere.by_statistics.all()
+    nothing = normalisation.make(skewed_spec, "none")
+    observation = jnp.array([1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(nothing({}, observation), observation)
+
+
+def test_features_over_the_bounds_refuse_senseless_ones(unbounded):
+    for features in (
+        lambda: rewards.radial_basis(unbounded, 3),
+        lambda: rewards.fourier(unbounded, 2),
+    ):
+        with pytest.raises(ValueError, match=r"Skewed-v0.*finite bounds"):
+            features()
+
+
+@given(npst.arrays(np.float32, (7, 2), elements=st.floats(-100, 100, width=32)))
+def test_running_statistics_are_those_of_all_observations(observations):
+    running = normalisation.begin(observations[0])
+    assert normalisation.of_running(running).std.tolist() == [1.0, 1.0]
+    for observation in observations[1:]:
+        running = normalisation.add(running, observation)
+    found = normalisation.of_running(running)
+    mean, std = (
+        observations.mean(axis=0, dtype=np.float64),
+        observations.std(axis=0, dtype=np.float64),
+    )
+    np.testing.assert_allclose(found.mean, mean, rtol=1e-4, atol=1e-3)
+    spread = std > 0.02 * np.maximum(np.abs(mean), 1.0)
+    np.testing.assert_allclose(found.std[spread], std[spread], rtol=1e-2)
+    together = normalisation.of_sample(observations)
+    np.testing.assert_allclose(together.std[spread], std[spread], rtol=1e-2)
+
+
+def test_a_constant_observation_is_not_divided_by_its_rounding():
+    observations = jnp.full((100, 2), 0.1) + jnp.array([0.0, 1e7])
+    np.testing.assert_array_equal(normalisation.of_sample(observations).std, [1.0, 1.0])
+
+
+def test_statistics_are_put_into_every_network_of_a_tree(unbounded):
+    actor = networks.make(unbounded).actor.init(KEY)
+    tree = {"a": actor, "b": (actor, jnp.zeros(3))}
+    assert normalisation.kept(tree)
+    assert not normalisation.kept({"params": jnp.zeros(2)})
+    put = normalisation.put(tree, Statistics(jnp.arange(3.0), jnp.full(3, 2.0)))
+    for one in (put["a"], put["b"][0]):
+        np.testing.assert_array_equal(one[STATISTICS]["mean"], [0, 1, 2])
+        np.testing.assert_array_equal(one[STATISTICS]["std"], [2, 2, 2])
+        chex.assert_trees_all_equal(one["params"], actor["params"])
+
+
+def batch(spec, size=5):
+    keys = jax.random.split(KEY, 3)
+    observation, following = jax.random.normal(keys[0], (2, size, spec.observation_dim))
+    action = jax.random.uniform(
+        keys[1], (size, spec.action_dim), minval=spec.action_low, maxval=spec.action_high
+    )
+    return Transition(observation, action, jnp.ones(size), following, jnp.zeros(size, bool))
+
+
+def test_no_gradient_and_no_weight_decay_reach_the_statistics(unbounded):
+    agent = ddpg.make(
+        unbounded, actor_optimizer=optax.adamw(0.1), critic_optimizer=optax.adamw(0.1)
+    )
+    params = tuple(network.init(KEY) for network in agent.networks[:2])
+    statistics = Statistics(jnp.arange(1.0, 4.0), jnp.full(3, 2.0))
+    state = agent.init(KEY, normalisation.put(params, statistics))
+    after, _ = agent.update(state, batch(unbounded))
+    for name in ("actor", "critic", "target_actor", "target_critic"):
+        kept = getattr(after, name)[STATISTICS]
+        np.testing.assert_allclose(kept["mean"], statistics.mean, rtol=1e-6)
+        np.testing.assert_allclose(kept["std"], statistics.std, rtol=1e-6)
+    assert not np.allclose(
+        after.actor["params"]["Dense_0"]["bias"], state.actor["params"]["Dense_0"]["bias"]
+    )
+
+
+def test_a_prior_is_of_weights_alone(unbounded):
+    params = rewards.mlp(unbounded, (4,)).init(KEY)
+    moved = normalisation.put(params, Statistics(jnp.full(3, 50.0), jnp.full(3, 70.0)))
+    assert regularisers.log_prior(params, 2.0) == regularisers.log_prior(moved, 2.0)
+    expected = -sum(float(jnp.sum(jnp.square(x))) for x in jax.tree.leaves(params["params"]))
+    assert float(regularisers.log_prior(moved, 2.0)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_networks_with_statistics_read_what_was_put(unbounded):
+    made = networks.make(unbounded, Architecture(normalise_observation="statistics"))
+    actor = made.actor.init(KEY)
+    observation = jnp.array([0.3, -2.0, 8.0])
+    statistics = Statistics(jnp.array([0.1, 2.0, -3.0]), jnp.array([2.0, 4.0, 5.0]))
+    expected = made.actor.apply(actor, (observation - statistics.mean) / statistics.std)
+    found = made.actor.apply(normalisation.put(actor, statistics), observation)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
