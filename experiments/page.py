@@ -26,12 +26,12 @@ CAPTIONS = {
 """What is written below each figure, in the page's order."""
 
 _STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 0 auto; max-width: 60rem;
+body { font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 0 auto; max-width: 66rem;
   padding: 1rem; }
 h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.5rem; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-size: 0.9rem; }
-th, td { border-bottom: 1px solid #ddd; padding: 0.3rem 0.6rem; text-align: left;
+th, td { border-bottom: 1px solid #ddd; padding: 0.3rem 0.5rem; text-align: left;
   vertical-align: top; }
 td.number { text-align: right; } td.number, td.name { white-space: nowrap; }
 small { color: #555; display: block; }
@@ -51,6 +51,9 @@ _COLUMNS = (
     ("iqm", "last return, IQM", "{:.2f}"),
 )
 """Columns of summary.csv with intervals, as the page shows them."""
+
+_EPISODES = ("convergence_episode_median", "episodes to solve, median", "{:,.0f}")
+"""In place of steps, where every seed lives as many episodes."""
 
 
 def page(
@@ -79,7 +82,7 @@ def page(
         f"demonstrators: {_text(config['expert'])}. Brackets are 95% intervals.</p>",
         _verdicts(claims),
         "<h2>Results</h2>",
-        _results(summary),
+        _results(summary, by_episodes=config["max_steps"] is None),
         *(_figure(name, figures[name]) for name in CAPTIONS if name in figures),
         _made(config, versions),
     ]
@@ -115,10 +118,14 @@ def _verdicts(claims: Sequence[Claim]) -> str:
     )
 
 
-def _results(summary: pl.DataFrame) -> str:
+def _results(summary: pl.DataFrame, by_episodes: bool) -> str:
+    columns = [
+        _EPISODES if by_episodes and name == "convergence_env_step_median" else (name, label, form)
+        for name, label, form in _COLUMNS
+    ]
     heads = [
         "method",
-        *(label for _, label, _ in _COLUMNS),
+        *(label for _, label, _ in columns),
         "best policy, its evaluation",
         "the same, fresh starts",
         "its expert",
@@ -132,7 +139,7 @@ def _results(summary: pl.DataFrame) -> str:
             + (f"<small>{_text(label)}</small>" if label else "")
             + "</td>"
         ]
-        cells += [_interval(row, column, form) for column, _, form in _COLUMNS]
+        cells += [_interval(row, column, form) for column, _, form in columns]
         cells += [
             f'<td class="number">{_number(row[column], "{:.2f}")}</td>'
             for column in ("best_evaluation_mean", "best_return_mean", "expert_return_mean")

@@ -81,6 +81,14 @@ def test_the_page_loads_nothing_and_runs_nothing(summary, tmp_path):
     assert "http" not in text
 
 
+def test_a_run_over_episodes_is_told_in_episodes(summary):
+    config = CONFIG | {"max_steps": None, "max_episodes": 30}
+    shown = " ".join(read(page.page(config, summary, [], {}, {})).shown)
+    assert "30 episodes each" in shown
+    assert "episodes to solve, median" in shown
+    assert "steps to solve" not in shown
+
+
 def test_without_verdicts_or_figures_there_is_still_a_page(summary, tmp_path):
     gone = {"figure3": tmp_path / "gone.png"}
     reader = read(page.page(CONFIG, summary, [], gone, {}))
