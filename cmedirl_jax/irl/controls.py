@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks, ranges
+from cmedirl_jax import checks, normalisation, ranges
 from cmedirl_jax.irl import base, regularisers, rewards
 from cmedirl_jax.irl.base import RewardLearner, RewardState
 from cmedirl_jax.irl.learner import IRLHParams
@@ -72,26 +72,24 @@ def random(
 ) -> RewardLearner:
     """Make r_D = share bound tanh(f), f a random network.
 
-    f has mean 0 and deviation 1 over uniform pairs. The reward carries no information about the
-    task. With the bound of a learned reward it varies more; `share` makes them comparable.
+    f has mean 0 and deviation 1 over uniform pairs; observations without sensible bounds are drawn
+    as their statistics will make them, normal. The reward carries no information about the task.
+    With the bound of a learned reward it varies more; `share` makes them comparable.
 
     Args:
-        spec: the environment's sizes and bounds, which have to be finite.
+        spec: the environment's sizes and bounds.
         hparams: only the bound is read.
         share: of the bound, positive.
         network: default `rewards.mlp(spec)`. Its first parameters have to make it vary.
 
     Raises:
-        ValueError: if the specification contradicts itself, a bound is infinite, or the bound of
-            the reward is out of range.
+        ValueError: if the specification contradicts itself, or the bound of the reward is out of
+            range.
     """
     checks.env_spec(spec)
     hparams = hparams or IRLHParams()
     ranges.check(hparams)
     checks.positive(share=share)
-    bounds = spec.observation_low, spec.observation_high
-    if not np.isfinite(bounds).all():
-        raise ValueError(f"{spec.id}: uniform pairs need finite bounds, got {bounds}")
     network = network or rewards.mlp(spec)
     return RewardLearner(
         init=functools.partial(_init_random, spec, network, hparams),
@@ -107,7 +105,7 @@ def _init_random(
     params = network.init(network_key)
     output = network.apply(
         params,
-        _uniform(observation_key, spec.observation_low, spec.observation_high),
+        _observations(observation_key, spec),
         _uniform(action_key, spec.action_low, spec.action_high),
     )
     standardised = RandomParams(params, jnp.mean(output), jnp.std(output))
@@ -126,6 +124,19 @@ def _random_reward(
     params, mean, deviation = state.params
     output = (network.apply(params, observation, action) - mean) / deviation
     return regularisers.bounded(output, share * state.hparams.bound)
+
+
+def _observations(key: jax.Array, spec: EnvSpec) -> jax.Array:
+    known = normalisation.sensible(spec)
+    if known.all():
+        return _uniform(key, spec.observation_low, spec.observation_high)
+    uniform_key, normal_key = jax.random.split(key)
+    low, high = (
+        np.where(known, bound, end)
+        for bound, end in ((spec.observation_low, 0.0), (spec.observation_high, 1.0))
+    )
+    normal = jax.random.normal(normal_key, (PROBES, len(known)), jnp.float32)
+    return jnp.where(known, _uniform(uniform_key, low, high), normal)
 
 
 def _uniform(key: jax.Array, low: np.ndarray, high: np.ndarray) -> jax.Array:

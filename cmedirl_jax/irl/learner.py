@@ -12,7 +12,6 @@ from typing import Annotated, Any, NamedTuple, cast
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
 from cmedirl_jax import checks, modes, normalisation, optimizers, ranges
@@ -315,8 +314,6 @@ def _steps(batch: RewardBatch) -> _Steps:
 
 
 def _units(spec: EnvSpec) -> tuple[jax.Array, jax.Array]:
-    """Half-widths of the ranges of observations `[O]` and actions `[A]`; 1 for infinite ones."""
-    low = (spec.observation_low, spec.action_low)
-    high = (spec.observation_high, spec.action_high)
-    widths = [0.5 * (above - below) for below, above in zip(low, high, strict=True)]
-    return tuple(jnp.asarray(np.where(np.isfinite(width), width, 1.0)) for width in widths)  # type: ignore[return-value]
+    """Half-widths of the ranges of observations `[O]` and actions `[A]`; 1 for senseless ones."""
+    observation = normalisation.make(spec, "bounds").half_width
+    return jnp.asarray(observation), jnp.asarray(0.5 * (spec.action_high - spec.action_low))

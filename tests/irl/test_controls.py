@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmedirl_jax.irl import IRLHParams, controls, rewards
+from cmedirl_jax.irl import IRLHParams, controls
 from cmedirl_jax.types import Network
 from tests.support.agents import SPEC, random_batch
 
@@ -87,7 +87,20 @@ def test_each_seed_has_its_own_random_reward():
     np.testing.assert_array_equal(jax.vmap(constant.init)(keys).params, np.float32([0.1] * 3))
 
 
-def test_infinite_bounds_are_refused():
+def test_observations_without_bounds_are_probed_as_their_statistics_make_them():
     spec = SPEC._replace(observation_low=np.float32([-np.inf, -0.07]))
-    with pytest.raises(ValueError, match=r"MountainCarContinuous-v0: .* finite bounds"):
-        controls.random(spec, network=rewards.mlp(SPEC))
+    learner = controls.random(spec)
+    state = learner.init(jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), 3)
+    observation = jnp.stack(
+        [
+            jax.random.normal(keys[0], (4_000,)),
+            jax.random.uniform(keys[1], (4_000,), minval=-0.07, maxval=0.07),
+        ],
+        axis=1,
+    )
+    action = jax.random.uniform(keys[2], (4_000, 1), minval=-1.0)
+    bound = float(state.hparams.bound)
+    f = np.arctanh(np.asarray(learner.reward(state, observation, action)) / bound)
+    assert abs(f.mean()) < 0.1
+    assert f.std() == pytest.approx(1.0, abs=0.1)
