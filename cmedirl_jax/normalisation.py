@@ -1,47 +1,25 @@
-"""How networks normalise observations: by the task's bounds, or by statistics of observations.
+"""How networks normalise observations: by the task's bounds, or by `observation_statistics`.
 
-Bounds that are infinite or senseless (+-3.4e38, +-1e30) say nothing of the observations. There the
-mean and standard deviation of observations stand among a network's parameters, under the name
-`STATISTICS`. So whatever holds the parameters (a checkpoint, a saved policy, a target network)
-normalises as the network does, and evaluation leaves the statistics alone. No gradient reaches
-them: `put` writes them, from demonstrations or from `Running` ones.
+Bounds that are infinite or senseless (+-3.4e38, +-1e30) say nothing of the observations.
 """
 
-from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, get_args
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax import checks, modes
-from cmedirl_jax.types import Array, EnvSpec, Params
+from cmedirl_jax.observation_statistics import STATISTICS, Statistics
+from cmedirl_jax.types import EnvSpec, Params
 
 Normalise = Literal["bounds", "statistics", "none"]
 
-STATISTICS = "observation_statistics"
-"""The name of the statistics among a network's parameters."""
-FIXED = (STATISTICS, "batch_stats")
-"""Names of parameters that no optimiser moves."""
 SENSIBLE = 1e6
 """Bounds of a larger magnitude say nothing of the observations."""
 CLIP = 10.0
 """Standard deviations at which an observation that is normalised by statistics is clipped."""
-LEAST_STD = 1e-4
-"""Of constant observations, as a share of their magnitude or of 1."""
-
-
-class Statistics(NamedTuple):
-    """Of observations.
-
-    Attributes:
-        mean: `[O]`.
-        std: `[O]`, positive.
-    """
-
-    mean: Array
-    std: Array
 
 
 class Normaliser(NamedTuple):
@@ -67,7 +45,8 @@ class Normaliser(NamedTuple):
         if not self.has_statistics:
             return {}
         size = self.centre.shape
-        return {STATISTICS: Statistics(jnp.zeros(size), jnp.ones(size))._asdict()}
+        first = Statistics(jnp.zeros(size, jnp.float32), jnp.ones(size, jnp.float32))
+        return {STATISTICS: first._asdict()}
 
     def __call__(self, variables: Params, observation: jax.Array) -> jax.Array:
         """Normalise `[..., O]` by the bounds, and by the statistics among `variables`."""
@@ -98,9 +77,12 @@ def make(spec: EnvSpec, kind: Normalise) -> Normaliser:
             "none".
 
     Raises:
-        ValueError: if the specification contradicts itself.
+        ValueError: for another kind, or if the specification contradicts itself.
     """
     checks.env_spec(spec)
+    if kind not in get_args(Normalise):
+        there = ", ".join(get_args(Normalise))
+        raise ValueError(f"normalise_observation is one of {there}, got {kind!r}")
     low, high, known = spec.observation_low, spec.observation_high, sensible(spec)
     size = spec.observation_dim
     if kind == "none":
@@ -133,86 +115,9 @@ def by_bounds(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
     return lambda observation: made({}, observation)
 
 
-def put(params: Any, statistics: Statistics) -> Any:
-    """Parameters, or a tree of them, with the statistics of every network in it replaced."""
-
-    def replaced(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
-        names = [getattr(key, "key", None) for key in path]
-        if STATISTICS not in names:
-            return leaf
-        return jnp.asarray(getattr(statistics, str(names[-1])), leaf.dtype)
-
-    return jax.tree_util.tree_map_with_path(replaced, params)
-
-
-def kept(params: Any) -> bool:
-    """Whether a network in a tree of parameters keeps statistics."""
-    return any(
-        STATISTICS in [getattr(key, "key", None) for key in path]
-        for path, _ in jax.tree_util.tree_flatten_with_path(params)[0]
-    )
-
-
-def trained(params: Any) -> Any:
-    """The parameters that optimisers move, of networks in a tree."""
-    if isinstance(params, Mapping):
-        return {name: trained(part) for name, part in params.items() if name not in FIXED}
-    if isinstance(params, tuple):
-        return tuple(trained(part) for part in params)
-    return params
-
-
-def fixed(updates: Any) -> Any:
-    """An optimiser's updates without those of `FIXED` parameters, which weight decay would move."""
-
-    def kept_still(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
-        names = [getattr(key, "key", None) for key in path]
-        return jnp.zeros_like(leaf) if any(name in FIXED for name in names) else leaf
-
-    return jax.tree_util.tree_map_with_path(kept_still, updates)
-
-
-def of_sample(observation: Array) -> Statistics:
-    """The statistics of observations `[N, O]`."""
-    mean = jnp.mean(observation, axis=0)
-    return Statistics(mean, _positive(mean, jnp.std(observation, axis=0)))
-
-
-class Running(flax.struct.PyTreeNode):
-    """Statistics of the observations so far, by Welford's algorithm.
-
-    Attributes:
-        count: `[]` float32.
-        mean: `[O]`.
-        squares: `[O]`, the sum of the squared differences to the mean.
-    """
-
-    count: jax.Array
-    mean: jax.Array
-    squares: jax.Array
-
-
-def begin(observation: jax.Array) -> Running:
-    """Running statistics of one observation `[O]`."""
-    first = jnp.asarray(observation, jnp.float32)
-    return Running(jnp.ones((), jnp.float32), first, jnp.zeros_like(first))
-
-
-def add(running: Running, observation: jax.Array) -> Running:
-    """Add an observation `[O]`."""
-    count = running.count + 1.0
-    before = observation - running.mean
-    mean = running.mean + before / count
-    return Running(count, mean, running.squares + before * (observation - mean))
-
-
-def of_running(running: Running) -> Statistics:
-    """The statistics so far; a standard deviation of 1 before the second observation."""
-    std = jnp.sqrt(running.squares / running.count)
-    std = jnp.where(running.count > 1.0, _positive(running.mean, std), 1.0)
-    return Statistics(running.mean, std)
-
-
-def _positive(mean: jax.Array, std: jax.Array) -> jax.Array:
-    # A constant observation has only rounding error to divide by.
-    return jnp.where(std > LEAST_STD * jnp.maximum(jnp.abs(mean), 1.0), std, 1.0)
+def units(spec: EnvSpec, params: Params) -> jax.Array:
+    """`[O]`, the size of an observation: half its range, else the deviation that `params` keep."""
+    made = make(spec, "bounds")
+    if not made.has_statistics or STATISTICS not in params:
+        return jnp.asarray(made.half_width)
+    return jnp.where(made.by_statistics, params[STATISTICS]["std"], made.half_width)

@@ -11,7 +11,7 @@ import functools
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import polars as pl
@@ -23,10 +23,10 @@ from cmedirl_jax.runs import paired
 from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
-from experiments import pooled
+from experiments import measures, pooled
 from experiments.evidence import said
-from experiments.measures import AREA, EPISODES, FINAL, STABLE, STEPS, Measure, speed
-from experiments.pooled import CellName, CellSeeds, Pooled
+from experiments.measures import AREA, EPISODES, FINAL, STABLE, STEPS, speed
+from experiments.pooled import CellName, CellSeeds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,15 +73,10 @@ def compare(
         say: called with a line on the cells that are left out.
 
     Raises:
-        UserError: as `pooled.load` and `pooled.pool`; if the seeds end at different steps; for a
-            single seed; if there is no cell of the method `against`, or none to compare with it.
+        UserError: as `pooled.load` and `pooled.pool`; for a single seed; if there is no cell of the
+            method `against`, or none to compare with it.
     """
     runs = pooled.pool([pooled.load(folder) for folder in folders])
-    if runs.episodes is None and runs.config["max_episodes"] is not None:
-        raise UserError(
-            f"{folders[0]}: its seeds end by --max-steps or by --max-episodes, whichever comes "
-            "first: they are not watched for as long"
-        )
     if runs.config["seeds"] < 2:
         raise UserError(f"{folders[0]}: one seed has no interval")
     rows = []
@@ -91,7 +86,7 @@ def compare(
         for measure in (speed(runs), AREA, FINAL, STABLE):
             labels = {"method": name[0], "n_demos": name[1]}
             labels |= {"against": other[0], "against_n_demos": other[1], "measure": measure.name}
-            rows.append(labels | _difference(measure, cell, reference, runs))
+            rows.append(labels | measures.difference(measure, (cell, runs), (reference, runs)))
     left_out = [name for name in runs.cells if not any(name in pair for pair in pairs)]
     if left_out:
         names = ", ".join(said(name) for name in left_out)
@@ -124,26 +119,6 @@ def _pairs(
     if not between + across:
         raise UserError(f"{folder}: holds no method beside {against} to compare with it")
     return between + across
-
-
-def _difference(
-    measure: Measure, cell: CellSeeds, reference: CellSeeds, runs: Pooled
-) -> dict[str, Any]:
-    mine, others = pooled.aligned(cell, reference)
-    found = paired.compare(
-        measure.of(cell, runs)[mine],
-        measure.of(reference, runs)[others],
-        pooled.clusters(cell, reference, mine, others),
-        span=measure.span(runs),
-    )
-    return {
-        "seeds": found.pairs,
-        "difference": found.mean.estimate,
-        "difference_low": found.mean.low,
-        "difference_high": found.mean.high,
-        "p_value": found.p_value,
-        "equivalence": paired.equivalence(found, measure.margin),
-    }
 
 
 _FORMS = {one.name: one.form for one in (STEPS, EPISODES, AREA, FINAL, STABLE)}

@@ -16,14 +16,15 @@ def survival(found: dict[str, SeedStatistics], last: float, by_episodes: bool) -
 
     Args:
         found: statistics of each method's seeds.
-        last: the step, or episode, at which all seeds end.
+        last: the step, or episode, at which the first seed ends; later ones are not drawn.
         by_episodes: whether the seeds all end at one episode, rather than at one step.
     """
     unit = "episodes" if by_episodes else "environment steps"
-    arrivals = {
+    times = {
         method: one.convergence_episode if by_episodes else one.convergence_env_step
         for method, one in found.items()
     }
+    arrivals = {method: np.where(one <= last, one, np.inf) for method, one in times.items()}
     first = next(iter(arrivals), "")
     labels = {
         method: curves.label(method) + ("" if method == first else _p_value(times, arrivals[first]))

@@ -45,7 +45,11 @@ def draw(
     )
     shown = evaluations.filter(largest)
     found = distributions.of_methods(shown, seeds.filter(largest), threshold, by_episodes)
-    last = shown["episode" if by_episodes else "env_step"].max()
+    column = "episode" if by_episodes else "env_step"
+    # Where the first seed ends, by whatever, though not by divergence.
+    alive = shown.join(seeds.filter(~pl.col("diverged")), on=of_seed, how="semi")
+    ends = alive.filter(pl.col("env_step") > 0).group_by("method", "seed").agg(pl.col(column).max())
+    last = ends[column].min()
     # The same starts as the evaluations'.
     expert = summary["expert_return_mean"].cast(pl.Float64).mean()
     expert = None if expert is None else float(expert)  # type: ignore[arg-type]
@@ -53,7 +57,7 @@ def draw(
         "figure3": lambda: average_return(
             curves.over(shown, by_episodes), episodes.filter(largest), expert, threshold
         ),
-        "survival": lambda: distributions.survival(found, float(last), by_episodes),  # type: ignore[arg-type]
+        "survival": lambda: distributions.survival(found, float(last or 0), by_episodes),  # type: ignore[arg-type]
         "profile": lambda: distributions.profile(found),
         "critic": lambda: critic(curves.over(shown, by_episodes)),
         "cost": lambda: cost(shown, seeds.filter(largest), threshold),

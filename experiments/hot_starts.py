@@ -21,7 +21,7 @@ import tyro
 from rich import box
 from rich.table import Table
 
-from cmedirl_jax import envs, networks, ranges
+from cmedirl_jax import envs, networks, observation_statistics, ranges
 from cmedirl_jax.agents import ddpg, hot_start
 from cmedirl_jax.agents.hot_start import HotStartData, HotStartHParams
 from cmedirl_jax.data import demonstrations
@@ -30,6 +30,7 @@ from cmedirl_jax.envs import Env
 from cmedirl_jax.ranges import Size
 from cmedirl_jax.runs import intervals, start, validation
 from cmedirl_jax.runs.cells import pools
+from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.console import compile_cache, ending, screen
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
@@ -99,18 +100,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise UserError(f"--env: {error}") from error
     pool = validation.load_demonstrations(options.demos, env, "dynamics")
     shared = pools.of_learners(pool, options.seeds)
-    table = pl.DataFrame([_row(critic, shared.data, env, options) for critic in CRITICS])
+    table = pl.DataFrame([_row(critic, shared, env, options) for critic in CRITICS])
     screen.show(screen.console(), shown(table))
     if options.out is not None:
         outputs.write(options.out, table.write_csv().encode())
     return 0
 
 
-def _row(critic: str, data: HotStartData, env: Env, options: Options) -> dict[str, object]:
-    found = of_critic(critic, data, env, options)
+def _row(critic: str, pool: LearnersPool, env: Env, options: Options) -> dict[str, object]:
+    found = of_critic(critic, pool.data, env, options)
+    experts = pool.expert if (pool.expert >= 0).all() else None
     row: dict[str, object] = {"critic": critic, "seeds": options.seeds}
     for name, values in found._asdict().items():
-        interval = intervals.mean(np.asarray(values, float))
+        interval = intervals.mean(np.asarray(values, float), clusters=experts)
         row |= {name: interval.estimate, f"{name}_low": interval.low, f"{name}_high": interval.high}
     return row
 
@@ -138,13 +140,15 @@ def _of_learner(
     # The hot start.
     actor_key, critic_key = jax.random.split(init_key)
     drawn = made.actor.init(actor_key), made.critic.init(critic_key)
+    shown = demonstrations.sample_index(sample_key, subset, SAMPLE)
+    statistics = observation_statistics.of_sample(jnp.asarray(data.transition.observation)[shown])
+    drawn = observation_statistics.put(drawn, statistics)
     hparams = HotStartHParams(critic=critic)  # type: ignore[arg-type]
     state = agent.init(init_key, hot_start.fit(fit_key, made, drawn, data, hparams, subset=subset))
 
     # Its values.
-    index = demonstrations.sample_index(sample_key, subset, SAMPLE)
-    steps = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], data.transition)
-    returns = jnp.asarray(data.discounted_return)[index]
+    steps = jax.tree.map(lambda leaf: jnp.asarray(leaf)[shown], data.transition)
+    returns = jnp.asarray(data.discounted_return)[shown]
     value = agent.value(state, steps.observation, steps.action)
     other = jax.random.uniform(
         action_key, steps.action.shape, minval=env.spec.action_low, maxval=env.spec.action_high

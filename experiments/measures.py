@@ -1,10 +1,12 @@
 """What cells are compared by: a number of each seed, and how large a difference matters."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from cmedirl_jax.runs import paired
+from experiments import pooled
 from experiments.pooled import CellSeeds, Pooled
 
 
@@ -61,6 +63,34 @@ def _dips(cell: CellSeeds, _: Pooled) -> np.ndarray:
 
 
 DIPS = Measure("dip_fraction", _dips, 0.02, "{:+.3f}", lambda _: 1.0)
+
+
+def difference(
+    measure: Measure, cell: tuple[CellSeeds, Pooled], reference: tuple[CellSeeds, Pooled]
+) -> dict[str, Any]:
+    """Columns on a cell against another, seed by seed.
+
+    Args:
+        measure: by what.
+        cell: with its runs.
+        reference: with its own, which may be other ones.
+    """
+    (mine, runs), (others, base) = cell, reference
+    here, there = pooled.aligned(mine, others)
+    found = paired.compare(
+        measure.of(mine, runs)[here],
+        measure.of(others, base)[there],
+        pooled.clusters(mine, others, here, there),
+        span=measure.span(runs),
+    )
+    return {
+        "seeds": found.pairs,
+        "difference": found.mean.estimate,
+        "difference_low": found.mean.low,
+        "difference_high": found.mean.high,
+        "p_value": found.p_value,
+        "equivalence": paired.equivalence(found, measure.margin),
+    }
 
 
 def speed(runs: Pooled) -> Measure:

@@ -62,6 +62,7 @@ def page(
     claims: Sequence[Claim],
     figures: Mapping[str, Path],
     versions: Mapping[str, str],
+    by_episodes: bool = False,
 ) -> str:
     """The page.
 
@@ -71,6 +72,7 @@ def page(
         claims: the verdicts; empty where there are none.
         figures: PNG files by their names in `CAPTIONS`; those that are gone are left out.
         versions: of the packages that made the run.
+        by_episodes: whether all seeds end at one episode, rather than at one step.
     """
     title = f"{config['env']}, {config['preset']}"
     budget = f"{config['max_steps']:,} environment steps" if config["max_steps"] else ""
@@ -82,7 +84,7 @@ def page(
         f"demonstrators: {_text(config['expert'])}. Brackets are 95% intervals.</p>",
         _verdicts(claims),
         "<h2>Results</h2>",
-        _results(summary, by_episodes=config["max_steps"] is None),
+        _results(summary, by_episodes),
         *(_figure(name, figures[name]) for name in CAPTIONS if name in figures),
         _made(config, versions),
     ]

@@ -72,16 +72,40 @@ class Pooled(NamedTuple):
     Attributes:
         cells: by name, in the order of the runs' tables.
         config: of the first run.
-        threshold: return that counts as solved in the first run.
         steps: the last environment step that a seed can reach.
-        episodes: after which every seed ends, at different steps; None where steps can end it.
+        episodes: after which every seed ends, at different steps; None where steps end it.
     """
 
     cells: dict[CellName, CellSeeds]
     config: dict[str, Any]
-    threshold: float
     steps: int
     episodes: int | None
+
+
+class Lifetime(NamedTuple):
+    """What ends the seeds of a run.
+
+    Attributes:
+        steps: the last environment step that a seed can reach.
+        episodes: after which every seed ends; None where steps end it.
+        mixed: some may end by steps and others by episodes, so that they are not watched for as
+            long in either.
+    """
+
+    steps: int
+    episodes: int | None
+    mixed: bool
+
+
+def lifetime(config: dict[str, Any]) -> Lifetime:
+    """What ends the seeds of a run, by its configuration."""
+    episodes, steps = config["max_episodes"], config["max_steps"]
+    if episodes is None:
+        return Lifetime(int(steps), None, False)
+    longest = episodes * envs.make(config["env"]).spec.max_episode_steps
+    if steps is None or longest <= steps:
+        return Lifetime(int(longest), episodes, False)
+    return Lifetime(int(steps), None, True)
 
 
 def load(folder: Path) -> Run:
@@ -101,8 +125,8 @@ def pool(runs: Sequence[Run]) -> Pooled:
     """Pool the cells of runs.
 
     Raises:
-        UserError: if a run is damaged or not finished, the configurations differ, or two runs hold
-            the same seeds.
+        UserError: if a run is damaged or not finished, the configurations differ, two runs hold the
+            same seeds, or the seeds are not watched for as long.
     """
     found: dict[CellName, list[CellSeeds]] = {}
     for run in runs:
@@ -117,11 +141,13 @@ def pool(runs: Sequence[Run]) -> Pooled:
             raise UserError(f"{last}: holds seeds of {method} that another folder holds too")
     first = runs[0].config
     with undamaged(runs[0].folder):
-        spec = envs.make(first["env"]).spec
-        episodes, steps = first["max_episodes"], first["max_steps"] or np.inf
-        longest = np.inf if episodes is None else episodes * spec.max_episode_steps
-        ends = episodes if longest <= steps else None
-        return Pooled(pooled, first, runs[0].threshold, int(min(steps, longest)), ends)
+        ends = lifetime(first)
+    if ends.mixed:
+        raise UserError(
+            f"{runs[0].folder}: its seeds end by --max-steps or by --max-episodes, whichever comes "
+            "first: they are not watched for as long"
+        )
+    return Pooled(pooled, first, ends.steps, ends.episodes)
 
 
 def check_alike(first: Run, other: Run, but: Sequence[str] = ()) -> None:

@@ -63,18 +63,17 @@ PRESETS: dict[str, StudyConfig] = {
 def preset(name: str, grid: str = "main", env: str = CAR) -> StudyConfig:
     """The configuration of a preset, on one of the two grids; `tuned` for an unknown name.
 
-    Other tasks have settings of their own under `tuned`, see `training.tasks`; `smoke` and `paper`
-    are as they are on the car.
+    On another task its experts have the settings that work there, see `training.tasks`; under
+    `tuned` its learners too, for as many steps.
     """
     config = PRESETS.get(name, PRESETS["tuned"])
     if env != CAR:
         task = tasks.of(env)
-        config = dataclasses.replace(config, env=env)
+        experts = dataclasses.replace(config.experts, settings=task.experts)
         if config.preset == "tuned":
-            experts = dataclasses.replace(config.experts, steps=task.expert_steps)
-            config = dataclasses.replace(
-                config, settings=task.settings, max_steps=task.steps, experts=experts
-            )
+            experts = dataclasses.replace(experts, steps=task.expert_steps)
+            config = dataclasses.replace(config, settings=task.settings, max_steps=task.steps)
+        config = dataclasses.replace(config, env=env, experts=experts)
     if grid != "full":
         return config
     steps = config.max_steps

@@ -14,7 +14,7 @@ from cmedirl_jax.runs.console import ending, screen, streams
 from cmedirl_jax.runs.storage import cells, outputs, tables
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.training.methods import METHODS
-from experiments import claims, figures, page, verdicts
+from experiments import claims, figures, page, pooled, verdicts
 from experiments.pooled import Run
 
 
@@ -60,7 +60,8 @@ class Report(NamedTuple):
 def report(folder: Path, redraw: bool = False) -> Report:
     """Write the tables, summary, verdicts, figures and page of the cells of config.json.
 
-    The verdicts wait until every cell is finished.
+    The verdicts wait until every cell is finished; there are none of seeds that are not watched for
+    as long.
 
     A file that would be as it is stays untouched; a figure is drawn if the summary has changed, it
     is gone, or `redraw` says so.
@@ -72,7 +73,7 @@ def report(folder: Path, redraw: bool = False) -> Report:
     written = run_folder.read(folder)
     config = written["config"]
     run_tables = tables.read(folder, config)
-    threshold = run_folder.solved(folder, written)
+    threshold, ends = run_folder.solved(folder, written), pooled.lifetime(config)
     summary = summarise(run_tables, threshold, config["max_episodes"])
     tables.write(folder, run_tables)
     # Figures and verdicts of another summary go before this one comes: those there belong to it.
@@ -92,16 +93,19 @@ def report(folder: Path, redraw: bool = False) -> Report:
             summary,
             threshold,
             wrong.append,
-            by_episodes=config["max_steps"] is None,
+            by_episodes=ends.episodes is not None,
         )
     # Verdicts, of a run that is whole.
     judged = []
-    if config["seeds"] > 1 and summary["seeds"].to_list() == [config["seeds"]] * _asked(config):
+    alike = config["seeds"] > 1 and not ends.mixed
+    if alike and summary["seeds"].to_list() == [config["seeds"]] * _asked(config):
         runs = claims.of_one_page([Run(folder, config, threshold, run_tables)])
         judged = verdicts.judge(runs)
         outputs.write(folder / "claims.md", claims.page(runs, judged).encode())
     pictures = {name: of_figure[0] for name, of_figure in files.items()}
-    text = page.page(config, summary, judged, pictures, written["versions"])
+    text = page.page(
+        config, summary, judged, pictures, written["versions"], ends.episodes is not None
+    )
     outputs.write(folder / "report.html", text.encode())
     return Report(summary, wrong)
 

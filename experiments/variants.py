@@ -23,7 +23,7 @@ from cmedirl_jax.runs import paired
 from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
-from experiments import pooled, run_grid
+from experiments import measures, pooled, run_grid
 from experiments.measures import AREA, FINAL, STABLE, STEPS, Measure
 from experiments.pooled import CellSeeds, Pooled
 
@@ -62,6 +62,7 @@ VARIANTS = (
             "transition-fusion": "--reward.objective transition "
             "--reward-batches.weights fusion --reward.weight-limit 3",
             "trajectory": "--reward.objective trajectory",
+            "trajectory-large": "--reward.objective trajectory --reward.bound 0.3",
             "zero-mean": "--reward.gauge zero-mean",
             "absorbing": "--reward.absorbing",
             "state": "--reward-network.inputs state",
@@ -161,9 +162,9 @@ def compare(folder: Path, variants: Sequence[Variant]) -> pl.DataFrame:
         if variant.base:
             pair = _cell(run), _cell(folder / variant.base)
             for measure in MEASURES:
-                found, p_value = _difference(measure, *pair)
+                found = measures.difference(measure, *pair)
+                p_values.append((len(rows), measure.name, found.pop("p_value")))
                 row |= {f"{measure.name}_{name}": value for name, value in found.items()}
-                p_values.append((len(rows), measure.name, p_value))
         rows.append(row)
     adjusted = paired.holm(np.array([p_value for *_, p_value in p_values]))
     for (index, name, _), p_value in zip(p_values, adjusted, strict=True):
@@ -175,26 +176,6 @@ def _cell(folder: Path) -> tuple[CellSeeds, Pooled]:
     run = pooled.pool([pooled.load(folder)])
     (cell,) = run.cells.values()
     return cell, run
-
-
-def _difference(
-    measure: Measure, one: tuple[CellSeeds, Pooled], other: tuple[CellSeeds, Pooled]
-) -> tuple[dict[str, Any], float]:
-    (cell, run), (reference, base) = one, other
-    mine, others = pooled.aligned(cell, reference)
-    found = paired.compare(
-        measure.of(cell, run)[mine],
-        measure.of(reference, base)[others],
-        pooled.clusters(cell, reference, mine, others),
-        span=measure.span(run),
-    )
-    columns = {
-        "difference": found.mean.estimate,
-        "difference_low": found.mean.low,
-        "difference_high": found.mean.high,
-        "equivalence": paired.equivalence(found, measure.margin),
-    }
-    return columns, found.p_value
 
 
 def shown(table: pl.DataFrame) -> Table:

@@ -96,10 +96,10 @@ def _near_expert(evidence: Evidence, name: CellName) -> Part | None:
     run = evidence.run_with(name, by_episodes=True)
     if run is None:
         return None
-    scores = _experts_returns(run)
-    if not set(run.cells[name].pair.tolist()) <= scores.keys():
+    experts = _experts(run)
+    if not set(run.cells[name].pair.tolist()) <= experts.keys():
         return Part(f"{said(name)}: no table says what its seeds' experts return", "unclear")
-    behind = _behind_experts(run, name, scores, episodes=120)
+    behind = _behind_experts(run, name, experts, episodes=120)
     if behind is None:
         return Part(f"{said(name)}: some seeds live no 120 episodes here", "unclear")
     outcome: Outcome = "unclear"
@@ -111,18 +111,20 @@ def _near_expert(evidence: Evidence, name: CellName) -> Part | None:
     return Part(f"{said(name)}, {measured}", outcome)
 
 
-def _experts_returns(run: Pooled) -> dict[int, float]:
-    """By pair, the return of its expert, whom every method of a pair shares."""
+def _experts(run: Pooled) -> dict[int, tuple[int, float]]:
+    """By pair, its expert, whom every method of a pair shares, and what that returns."""
     return {
-        pair: score
+        pair: (expert, score)
         for cell in run.cells.values()
-        for pair, score in zip(cell.pair.tolist(), cell.expert_return.tolist(), strict=True)
+        for pair, expert, score in zip(
+            *(x.tolist() for x in (cell.pair, cell.expert, cell.expert_return)), strict=True
+        )
         if np.isfinite(score)
     }
 
 
 def _behind_experts(
-    run: Pooled, name: CellName, scores: dict[int, float], episodes: int
+    run: Pooled, name: CellName, experts: dict[int, tuple[int, float]], episodes: int
 ) -> Interval | None:
     """Return minus the expert's at each seed's first evaluation from so many episodes on."""
     cell = run.cells[name]
@@ -135,9 +137,8 @@ def _behind_experts(
     )
     if reached.height < cell.pair.size:
         return None
-    expert = np.array([scores[pair] for pair in reached["pair"].to_list()])
-    difference = reached["return_mean"].cast(pl.Float64).to_numpy() - expert
-    clusters = cell.expert[np.argsort(cell.pair)]
+    clusters, scores = map(np.array, zip(*(experts[pair] for pair in reached["pair"]), strict=True))
+    difference = reached["return_mean"].cast(pl.Float64).to_numpy() - scores
     return intervals.mean(difference, clusters=clusters if (clusters >= 0).all() else None)
 
 

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from cmedirl_jax import networks, normalisation
+from cmedirl_jax import networks, normalisation, observation_statistics
 from cmedirl_jax.agents import ddpg
 from cmedirl_jax.irl import regularisers, rewards
 from cmedirl_jax.networks import Architecture
-from cmedirl_jax.normalisation import STATISTICS, Statistics
+from cmedirl_jax.observation_statistics import STATISTICS, Statistics
 from cmedirl_jax.types import Transition
 
 KEY = jax.random.key(0)
@@ -69,11 +69,11 @@ def test_features_over_the_bounds_refuse_senseless_ones(unbounded):
 
 @given(npst.arrays(np.float32, (7, 2), elements=st.floats(-100, 100, width=32)))
 def test_running_statistics_are_those_of_all_observations(observations):
-    running = normalisation.begin(observations[0])
-    assert normalisation.of_running(running).std.tolist() == [1.0, 1.0]
+    running = observation_statistics.begin(observations[0])
+    assert observation_statistics.of_running(running).std.tolist() == [1.0, 1.0]
     for observation in observations[1:]:
-        running = normalisation.add(running, observation)
-    found = normalisation.of_running(running)
+        running = observation_statistics.add(running, observation)
+    found = observation_statistics.of_running(running)
     mean, std = (
         observations.mean(axis=0, dtype=np.float64),
         observations.std(axis=0, dtype=np.float64),
@@ -81,21 +81,21 @@ def test_running_statistics_are_those_of_all_observations(observations):
     np.testing.assert_allclose(found.mean, mean, rtol=1e-4, atol=1e-3)
     spread = std > 0.02 * np.maximum(np.abs(mean), 1.0)
     np.testing.assert_allclose(found.std[spread], std[spread], rtol=1e-2)
-    together = normalisation.of_sample(observations)
+    together = observation_statistics.of_sample(observations)
     np.testing.assert_allclose(together.std[spread], std[spread], rtol=1e-2)
 
 
 def test_a_constant_observation_is_not_divided_by_its_rounding():
     observations = jnp.full((100, 2), 0.1) + jnp.array([0.0, 1e7])
-    np.testing.assert_array_equal(normalisation.of_sample(observations).std, [1.0, 1.0])
+    np.testing.assert_array_equal(observation_statistics.of_sample(observations).std, [1.0, 1.0])
 
 
 def test_statistics_are_put_into_every_network_of_a_tree(unbounded):
     actor = networks.make(unbounded).actor.init(KEY)
     tree = {"a": actor, "b": (actor, jnp.zeros(3))}
-    assert normalisation.kept(tree)
-    assert not normalisation.kept({"params": jnp.zeros(2)})
-    put = normalisation.put(tree, Statistics(jnp.arange(3.0), jnp.full(3, 2.0)))
+    assert observation_statistics.kept(tree)
+    assert not observation_statistics.kept({"params": jnp.zeros(2)})
+    put = observation_statistics.put(tree, Statistics(jnp.arange(3.0), jnp.full(3, 2.0)))
     for one in (put["a"], put["b"][0]):
         np.testing.assert_array_equal(one[STATISTICS]["mean"], [0, 1, 2])
         np.testing.assert_array_equal(one[STATISTICS]["std"], [2, 2, 2])
@@ -117,7 +117,7 @@ def test_no_gradient_and_no_weight_decay_reach_the_statistics(unbounded):
     )
     params = tuple(network.init(KEY) for network in agent.networks[:2])
     statistics = Statistics(jnp.arange(1.0, 4.0), jnp.full(3, 2.0))
-    state = agent.init(KEY, normalisation.put(params, statistics))
+    state = agent.init(KEY, observation_statistics.put(params, statistics))
     after, _ = agent.update(state, batch(unbounded))
     for name in ("actor", "critic", "target_actor", "target_critic"):
         kept = getattr(after, name)[STATISTICS]
@@ -130,7 +130,7 @@ def test_no_gradient_and_no_weight_decay_reach_the_statistics(unbounded):
 
 def test_a_prior_is_of_weights_alone(unbounded):
     params = rewards.mlp(unbounded, (4,)).init(KEY)
-    moved = normalisation.put(params, Statistics(jnp.full(3, 50.0), jnp.full(3, 70.0)))
+    moved = observation_statistics.put(params, Statistics(jnp.full(3, 50.0), jnp.full(3, 70.0)))
     assert regularisers.log_prior(params, 2.0) == regularisers.log_prior(moved, 2.0)
     expected = -sum(float(jnp.sum(jnp.square(x))) for x in jax.tree.leaves(params["params"]))
     assert float(regularisers.log_prior(moved, 2.0)) == pytest.approx(expected, rel=1e-5)
@@ -142,5 +142,21 @@ def test_networks_with_statistics_read_what_was_put(unbounded):
     observation = jnp.array([0.3, -2.0, 8.0])
     statistics = Statistics(jnp.array([0.1, 2.0, -3.0]), jnp.array([2.0, 4.0, 5.0]))
     expected = made.actor.apply(actor, (observation - statistics.mean) / statistics.std)
-    found = made.actor.apply(normalisation.put(actor, statistics), observation)
+    found = made.actor.apply(observation_statistics.put(actor, statistics), observation)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_the_unit_of_an_observation_is_its_range_or_its_deviation(unbounded, skewed_spec):
+    params = networks.make(unbounded).actor.init(KEY)
+    params = observation_statistics.put(
+        params, Statistics(jnp.zeros(3), jnp.array([7.0, 2.0, 4.0]))
+    )
+    width = 0.5 * (skewed_spec.observation_high - skewed_spec.observation_low)
+    np.testing.assert_allclose(normalisation.units(unbounded, params), [width[0], 2.0, 4.0])
+    np.testing.assert_allclose(normalisation.units(skewed_spec, {}), width)
+
+
+@pytest.mark.parametrize("kind", [True, False, "mean"])
+def test_another_kind_of_normalisation_is_refused(skewed_spec, kind):
+    with pytest.raises(ValueError, match="is one of bounds, statistics, none, got"):
+        normalisation.make(skewed_spec, kind)

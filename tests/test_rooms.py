@@ -11,7 +11,8 @@ from tests.support import ROOT
 LIBRARY = ROOT / "cmedirl_jax"
 TOP = (
     *("types", "checks", "ranges", "registries"),
-    *("networks", "normalisation", "products", "optimizers", "grids", "modes"),
+    *("networks", "normalisation", "observation_statistics"),
+    *("products", "optimizers", "grids", "modes"),
 )
 ROOMS = ("io", "envs", "data", "agents", "irl", "tabular", "training", "runs")
 ORDER = dict.fromkeys(TOP, 0) | {name: place + 1 for place, name in enumerate(ROOMS)}

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import checks, modes, normalisation, optimizers, ranges
+from cmedirl_jax import checks, modes, observation_statistics, optimizers, ranges
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.networks import ActorCritic
 from cmedirl_jax.optimizers import traced
@@ -267,7 +267,7 @@ def _update_critic(
     updates, optimizer = parts.critic_optimizer.update(
         grads, state.critic_optimizer, critic, learning_rate=state.hparams.critic_learning_rate
     )
-    critic = optax.apply_updates(critic, normalisation.fixed(updates))
+    critic = optax.apply_updates(critic, observation_statistics.fixed(updates))
     return state.replace(critic=critic, critic_optimizer=optimizer), loss, jnp.mean(q)
 
 
@@ -290,7 +290,7 @@ def _update_actor(
     updates, optimizer = parts.actor_optimizer.update(
         grads, state.actor_optimizer, actor, learning_rate=state.hparams.actor_learning_rate
     )
-    actor = optax.apply_updates(actor, normalisation.fixed(updates))
+    actor = optax.apply_updates(actor, observation_statistics.fixed(updates))
     # 32 bits under x64 too, as in the branch that leaves the actor alone.
     return state.replace(actor=actor, actor_optimizer=optimizer), loss.astype(jnp.float32)
 

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cmedirl_jax import checks, normalisation, ranges
+from cmedirl_jax import checks, observation_statistics, ranges
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.hot_start_data import HotStartData, prepare
@@ -133,7 +133,7 @@ def _step(
     index = demonstrations_lib.sample_index(key, chosen, hparams.batch_size)
     grads, params = jax.grad(_loss, has_aux=True)(params, networks, hparams, pool, index)
     updates, state = optimizer.update(grads, state, params)
-    return (optax.apply_updates(params, normalisation.fixed(updates)), state), None
+    return (optax.apply_updates(params, observation_statistics.fixed(updates)), state), None
 
 
 def _loss(

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax.types import EnvSpec
@@ -41,6 +42,32 @@ class StepFn(Protocol):
     ) -> tuple[Any, Step]:
         """Return the new state and its `Step`, for `action` `[A]`."""
         ...
+
+
+Reset = tuple[Any, jax.Array]
+"""A first state, and its observation `[O]`."""
+
+
+def fixed_starts(reset: ResetFn) -> Callable[[int, Any], Reset]:
+    """Evaluation starts of fixed keys: `(count, params) -> (states, observations)`."""
+
+    def starts(count: int, params: Any) -> Reset:
+        keys = jax.random.split(jax.random.key(0), count)
+        return jax.vmap(reset, in_axes=(0, None))(keys, params)
+
+    return starts
+
+
+def cast_like(state: Any, like: Any) -> Any:
+    """A state whose leaves have the types of another's, where `reset` and `step` differ in them."""
+
+    def cast(leaf: Any, wanted: Any) -> jax.Array:
+        leaf = jnp.asarray(leaf)
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return leaf
+        return jax.lax.convert_element_type(leaf, wanted.dtype)
+
+    return jax.tree.map(cast, state, like)
 
 
 class Env(NamedTuple):

@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.envs.base import Env, Step
-from cmedirl_jax.envs.shapes import Reset, cast_like, fixed_starts
+from cmedirl_jax.envs.base import Env, Reset, Step, cast_like, fixed_starts
 from cmedirl_jax.types import EnvSpec
 
 

@@ -14,8 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.envs.base import Env, Step
-from cmedirl_jax.envs.shapes import Reset, cast_like, fixed_starts
+from cmedirl_jax.envs.base import Env, Reset, Step, cast_like, fixed_starts
 from cmedirl_jax.types import EnvSpec
 
 
@@ -73,11 +72,14 @@ def _reset(env: Any, spec: EnvSpec, key: jax.Array, params: Any) -> Reset:
 
 def _step(env: Any, key: jax.Array, state: Any, action: jax.Array, params: Any) -> tuple[Any, Step]:
     observation, after, reward, done, _ = env.step_env(key, state, action, params)
+    # At the time limit the end counts as the task's own if it would be one at time 0 too.
+    truncated = jnp.asarray(after.time >= params.max_steps_in_episode, bool)
     untimed = after.replace(time=jnp.zeros_like(after.time))
+    at_any_time = jnp.asarray(env.is_terminal(untimed, params), bool)
     step = Step(
         jnp.asarray(observation, jnp.float32),
         jnp.asarray(reward, jnp.float32).reshape(()),
-        jnp.asarray(done, bool) & jnp.asarray(env.is_terminal(untimed, params), bool),
-        jnp.asarray(after.time >= params.max_steps_in_episode, bool),
+        jnp.asarray(done, bool) & (at_any_time | ~truncated),
+        truncated,
     )
     return cast_like(after, state), step

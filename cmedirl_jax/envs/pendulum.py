@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.envs.base import Env, Step
+from cmedirl_jax.envs.base import Env, Step, fixed_starts
 from cmedirl_jax.types import EnvSpec, Numeric
 
 
@@ -73,7 +73,7 @@ SPEC = EnvSpec(
 
 def make() -> Env:
     """Make the environment; Gymnasium's physics are its default parameters."""
-    return Env(SPEC, PendulumParams(), reset, step, starts, state_at, gymnasium_state)
+    return Env(SPEC, PendulumParams(), reset, step, fixed_starts(reset), state_at, gymnasium_state)
 
 
 def reset(key: jax.Array, params: PendulumParams) -> tuple[PendulumState, jax.Array]:
@@ -85,11 +85,6 @@ def reset(key: jax.Array, params: PendulumParams) -> tuple[PendulumState, jax.Ar
         jnp.zeros((), jnp.int32),
     )
     return state, _observe(state)
-
-
-def starts(count: int, params: PendulumParams) -> tuple[PendulumState, jax.Array]:
-    """`count` start states, of fixed keys."""
-    return jax.vmap(reset, in_axes=(0, None))(jax.random.split(jax.random.key(0), count), params)
 
 
 def step(

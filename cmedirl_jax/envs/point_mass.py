@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.envs.base import Env, Step
+from cmedirl_jax.envs.base import Env, Step, fixed_starts
 from cmedirl_jax.types import Array, EnvSpec, Numeric
 
 
@@ -88,7 +88,7 @@ SPEC = EnvSpec(
 
 def make() -> Env:
     """Make the environment; observations are the position and the velocity."""
-    return Env(SPEC, PointMassParams(), reset, step, starts, state_at)
+    return Env(SPEC, PointMassParams(), reset, step, fixed_starts(reset), state_at)
 
 
 def reset(key: jax.Array, params: PointMassParams) -> tuple[PointMassState, jax.Array]:
@@ -97,11 +97,6 @@ def reset(key: jax.Array, params: PointMassParams) -> tuple[PointMassState, jax.
     position = jnp.asarray(params.start + params.start_width * offset, jnp.float32)
     state = PointMassState(position, jnp.zeros(2, jnp.float32), jnp.zeros((), jnp.int32))
     return state, _observe(state)
-
-
-def starts(count: int, params: PointMassParams) -> tuple[PointMassState, jax.Array]:
-    """`count` start states, of fixed keys."""
-    return jax.vmap(reset, in_axes=(0, None))(jax.random.split(jax.random.key(0), count), params)
 
 
 def step(

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import checks, normalisation, optimizers, ranges
+from cmedirl_jax import checks, observation_statistics, optimizers, ranges
 from cmedirl_jax.irl import base, regularisers, rewards
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.optimizers import traced
@@ -131,7 +131,7 @@ def _update(
     updates, optimizer_state = parts.optimizer.update(
         gradient, state.optimizer, state.params, learning_rate=state.hparams.learning_rate
     )
-    params = optax.apply_updates(state.params, normalisation.fixed(updates))
+    params = optax.apply_updates(state.params, observation_statistics.fixed(updates))
 
     # Diagnostics, of the state before.
     r_d = _of_logit(evaluation.demonstrations, state.hparams)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import checks, modes, normalisation, optimizers, ranges
+from cmedirl_jax import checks, modes, normalisation, observation_statistics, optimizers, ranges
 from cmedirl_jax.irl import base, objectives, regularisers, rewards
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.irl.objectives import OBJECTIVES, Likelihood, ObjectiveName
@@ -211,7 +211,9 @@ def _update(
     if hparams.gauge != "none":
         target = regularisers.gauge_offset(hparams.gauge, *scored)
         offset += (hparams.gauge_rate * (target - offset)).astype(offset.dtype)
-    network, absorbing = cast(Any, optax.apply_updates(learned, normalisation.fixed(updates)))
+    network, absorbing = cast(
+        Any, optax.apply_updates(learned, observation_statistics.fixed(updates))
+    )
     params = RewardParams(network, offset, absorbing)
     return state.replace(params=params, optimizer=optimizer_state), info
 
@@ -263,7 +265,10 @@ def _gradient_penalty(
         observation,
         action,
         steps[0].mask[:size] & steps[1].mask[:size],
-        scale=_units(parts.spec),
+        scale=(
+            normalisation.units(parts.spec, params),
+            jnp.asarray(0.5 * (parts.spec.action_high - parts.spec.action_low)),
+        ),
         target=hparams.gradient_penalty_target,
     )
 
@@ -311,9 +316,3 @@ def _steps(batch: RewardBatch) -> _Steps:
         action.reshape(-1, action.shape[-1]),
         batch.mask.reshape(-1),
     )
-
-
-def _units(spec: EnvSpec) -> tuple[jax.Array, jax.Array]:
-    """Half-widths of the ranges of observations `[O]` and actions `[A]`; 1 for senseless ones."""
-    observation = normalisation.make(spec, "bounds").half_width
-    return jnp.asarray(observation), jnp.asarray(0.5 * (spec.action_high - spec.action_low))

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from cmedirl_jax import normalisation
+from cmedirl_jax import observation_statistics
 from cmedirl_jax.types import Numeric, Params
 
 BoundKind = Literal["tanh", "clip", "none"]
@@ -24,7 +24,7 @@ def log_prior(params: Params, precision: Numeric) -> jax.Array:
 
     Statistics among the parameters do not count.
     """
-    return -0.5 * precision * optax.tree.norm(normalisation.trained(params), squared=True)
+    return -0.5 * precision * optax.tree.norm(observation_statistics.trained(params), squared=True)
 
 
 def output_penalty(output: jax.Array, mask: jax.Array) -> jax.Array:

@@ -26,11 +26,13 @@ class ExpertSettings:
         steps: Environment steps of each expert.
         trajectories: Trajectories that a learner draws its demonstrations from, at least. Default:
             200 of its own expert, or 1,024 that all share; more if n-demos asks for more.
+        settings: What they train with; the task's, see `training.tasks`.
     """
 
     seeds: Size | None = None
     steps: Size = 14_000
     trajectories: Size | None = None
+    settings: tyro.conf.Suppress[Settings] = Settings()
 
 
 class Experts(NamedTuple):
@@ -41,12 +43,14 @@ class Experts(NamedTuple):
         seeds: experts trained.
         steps: environment steps of each.
         trajectories: that a learner draws its demonstrations from, at least.
+        settings: what the experts train with.
     """
 
     which: Expert
     seeds: int
     steps: int
     trajectories: int
+    settings: Settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,6 +135,7 @@ class StudyConfig:
             self.experts.seeds or (self.seeds if each else 16),
             self.experts.steps,
             self.experts.trajectories or max(200 if each else 1_024, *self.n_demos),
+            self.experts.settings,
         )
 
     @property

@@ -70,17 +70,21 @@ def _narrow(difference: np.ndarray, clusters: np.ndarray | None, span: float) ->
     units = np.arange(difference.size) if clusters is None else clusters
     if np.unique(units).size == 1:
         units = np.arange(difference.size)
-    count = np.unique(units).size
-    if count < LEAST_PAIRS:
+    _, sizes = np.unique(units, return_counts=True)
+    if sizes.size < LEAST_PAIRS:
         return Interval(found.estimate, -np.inf, np.inf)
-    below, above = (np.unique(units[side]).size for side in (difference < 0, difference > 0))
-    if below + above >= intervals.LEAST_EVENTS:
+    if np.unique(units[difference != 0]).size >= intervals.LEAST_EVENTS:
         return found
     # A bootstrap knows nothing of differences that it did not see. The mean is at most the span
-    # times the probability of a difference on that side, which has an exact bound.
+    # times the probability of a difference on that side, which has an exact bound; a large cluster
+    # may be one that differs.
+    largest = span * sizes.max() / sizes.mean()
     low, high = (
-        span * scipy.stats.binomtest(side, count).proportion_ci(EQUIVALENCE_CONFIDENCE).high
-        for side in (below, above)
+        largest
+        * scipy.stats.binomtest(np.unique(units[side]).size, sizes.size)
+        .proportion_ci(EQUIVALENCE_CONFIDENCE)
+        .high
+        for side in (difference < 0, difference > 0)
     )
     return Interval(found.estimate, -low, high)
 

@@ -103,11 +103,18 @@ def of_seeds(
             evaluations by episodes where there are any: by steps, a seed's failures, whose episodes
             are long, would count more than its successes.
     """
-    found = _of_curves(curves(evaluations), diverged, threshold)
+    by_steps = curves(evaluations)
+    found = _of_curves(by_steps, diverged, threshold)
     over_episodes = curves(evaluations, "episodes") if by_episodes else {}
-    if len(over_episodes) == len(diverged):
-        found = found._replace(area=_of_curves(over_episodes, diverged, threshold).area)
+    if over_episodes:
+        # A seed that diverged before its first one stands at its lowest return throughout.
+        every = {seed: over_episodes.get(seed, _lowest(curve)) for seed, curve in by_steps.items()}
+        found = found._replace(area=_of_curves(every, diverged, threshold).area)
     return found
+
+
+def _lowest(curve: SeedCurve) -> SeedCurve:
+    return SeedCurve(curve.env_step[:1], curve.episode[:1], curve.return_mean.min(keepdims=True))
 
 
 def _of_curves(

@@ -30,7 +30,7 @@ from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage.cells import CellKey
 from cmedirl_jax.runs.storage.checkpoints import Checkpointer
 from cmedirl_jax.runs.validation import Plan
-from cmedirl_jax.training import seeds, tasks
+from cmedirl_jax.training import seeds
 from cmedirl_jax.training.methods import METHODS, Method
 from cmedirl_jax.training.settings import Settings
 
@@ -179,6 +179,10 @@ def _note_scale(session: Session, pool: Demonstrations) -> float:
     plan = session.plan
 
     def measure() -> dict[str, float]:
+        # What a run was begun with stays: its finished cells were judged by it.
+        noted = run_folder.read(plan.folder).get("scale")
+        if noted is not None:
+            return noted
         found = scale.measure(plan.env, pool, plan.budget.evaluation_starts)
         run_folder.note_scale(plan.folder, found._asdict())
         return found._asdict()
@@ -201,7 +205,7 @@ def _train_experts(
         session.keys.experts,
         plan.env,
         plan.experts,
-        session.compiled(METHODS["ddpg"], tasks.of(plan.env.spec.id).experts, plan.seeds),
+        session.compiled(METHODS["ddpg"], plan.experts.settings, plan.seeds),
         plan.budget.evaluation_starts,
         _stepwise(report, plan.experts.seeds),
         checkpointer,

@@ -8,7 +8,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import modes, normalisation
+from cmedirl_jax import modes, observation_statistics
 from cmedirl_jax.agents import hot_start
 from cmedirl_jax.agents.ddpg import DDPGState
 from cmedirl_jax.agents.hot_start import HotStartData
@@ -17,6 +17,7 @@ from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.envs import Env
 from cmedirl_jax.irl import RewardState
 from cmedirl_jax.irl.reward_batches import SamplerState
+from cmedirl_jax.observation_statistics import Running
 from cmedirl_jax.tabular import imitation, table_reward
 from cmedirl_jax.training.compose import Algorithm
 from cmedirl_jax.training.methods import Method
@@ -61,7 +62,7 @@ class TrainingState(flax.struct.PyTreeNode):
     episode_return: jax.Array
     episode_length: jax.Array
     subset: DemonstrationSubset | None
-    observation_statistics: normalisation.Running | None = None
+    observation_statistics: Running | None = None
 
 
 class Initialisation(NamedTuple):
@@ -180,13 +181,13 @@ def _with_statistics(
     keys: SeedKeys, data: HotStartData, subset: DemonstrationSubset, params: Tree
 ) -> Tree:
     """Give networks that keep statistics those of a sample of the demonstrations."""
-    if not normalisation.kept(params):
+    if not observation_statistics.kept(params):
         return params
     rows = demonstrations_lib.sample_index(
         jax.random.fold_in(keys.subset, 0), subset, STATISTICS_SAMPLE
     )
     observations = jnp.asarray(data.transition.observation)[rows]
-    return normalisation.put(params, normalisation.of_sample(observations))
+    return observation_statistics.put(params, observation_statistics.of_sample(observations))
 
 
 def _init(
@@ -221,8 +222,8 @@ def _init(
     # The first episode.
     env_state, observation = parts.env.reset(keys.env, parts.env_params)
     running = None
-    if normalisation.kept(networks) and not parts.method.uses_demonstrations:
-        running = normalisation.begin(observation)
+    if observation_statistics.kept(networks) and not parts.method.uses_demonstrations:
+        running = observation_statistics.begin(observation)
     state = TrainingState(
         key=steps_key,
         agent=algorithm.agent.init(keys.agent, networks),

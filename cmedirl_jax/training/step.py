@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import modes, normalisation
+from cmedirl_jax import modes, observation_statistics
 from cmedirl_jax.agents.ddpg import DDPGState
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.data.replay import ReplayState
@@ -150,7 +150,7 @@ def learn(
 
     # Learn the agent.
     agent, losses = _learn_agent(parts, state.agent, reward, replay_state, draws, plan, pool)
-    agent, reward, statistics = _move_statistics(state, answer, agent, reward)
+    agent, reward, statistics = _move_statistics(state, answer, next_start, ended, agent, reward)
     losses = losses._replace(added=losses.added or stored)
     done = ended
     if max_episodes is not None:
@@ -254,22 +254,31 @@ def _learn_agent(
 
 
 def _move_statistics(
-    state: TrainingState, answer: Step, agent: DDPGState, reward: RewardState | None
-) -> tuple[DDPGState, RewardState | None, normalisation.Running | None]:
-    """Add the new observation to the running statistics, and give them to every network."""
+    state: TrainingState,
+    answer: Step,
+    next_start: jax.Array,
+    ended: jax.Array,
+    agent: DDPGState,
+    reward: RewardState | None,
+) -> tuple[DDPGState, RewardState | None, observation_statistics.Running | None]:
+    """Add the new observations to the running statistics, and give them to every network.
+
+    So does a random reward normalise, whose weights stay.
+    """
     running = state.observation_statistics
     if running is None:
         return agent, reward, None
-    running = normalisation.add(running, answer.observation)
-    statistics = normalisation.of_running(running)
+    running = observation_statistics.add(running, answer.observation)
+    running = select(ended, observation_statistics.add(running, next_start), running)
+    statistics = observation_statistics.of_running(running)
     agent = agent.replace(
         **{
-            name: normalisation.put(getattr(agent, name), statistics)
+            name: observation_statistics.put(getattr(agent, name), statistics)
             for name in ("actor", "critic", "target_actor", "target_critic")
         }
     )
     if reward is not None:
-        reward = reward.replace(params=normalisation.put(reward.params, statistics))
+        reward = reward.replace(params=observation_statistics.put(reward.params, statistics))
     return agent, reward, running
 
 

@@ -86,6 +86,15 @@ def test_termination_and_time_limit_are_told_apart():
     assert ends(env, 0.0) == (30, False, True)
 
 
+def test_an_end_that_depends_on_the_time_is_one_before_the_limit():
+    class Hurry(Walk):
+        def is_terminal(self, state, params):
+            late = jnp.logical_and(state.time >= 10, state.position < 0.5)
+            return jnp.logical_or(super().is_terminal(state, params), late)
+
+    assert ends(envs.from_gymnax(Hurry()), 0.0) == (10, True, False)
+
+
 def test_parameters_are_traced_and_can_be_given():
     env = envs.from_gymnax(Walk(), Params(push=0.2), id="Fast-v0", reward_threshold=-4.0)
     assert (env.spec.id, env.spec.reward_threshold) == ("Fast-v0", -4.0)

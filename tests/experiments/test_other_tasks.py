@@ -71,7 +71,7 @@ def test_without_a_threshold_and_experts_a_run_is_not_read(run, tmp_path):
 @pytest.mark.parametrize("scale", [{"solved": "high"}, {}, []])
 def test_a_damaged_scale_is_a_users_error(run, tmp_path, scale):
     written = json.loads((run / "config.json").read_text()) | {"scale": scale}
-    with pytest.raises(UserError, match="names no task and no scale"):
+    with pytest.raises(UserError, match="is not a readable configuration"):
         run_folder.solved(tmp_path, written)
 
 

@@ -83,7 +83,7 @@ def test_the_page_loads_nothing_and_runs_nothing(summary, tmp_path):
 
 def test_a_run_over_episodes_is_told_in_episodes(summary):
     config = CONFIG | {"max_steps": None, "max_episodes": 30}
-    shown = " ".join(read(page.page(config, summary, [], {}, {})).shown)
+    shown = " ".join(read(page.page(config, summary, [], {}, {}, by_episodes=True)).shown)
     assert "30 episodes each" in shown
     assert "episodes to solve, median" in shown
     assert "steps to solve" not in shown

@@ -82,7 +82,7 @@ def judged(claim, *, by_episodes=False, **cells):
         method = method.replace("_", "-")
         number = int(n_demos or 0 if method == "ddpg" else n_demos or 200)
         named[method, number] = one
-    run = Pooled(named, {"seeds": SEEDS}, 90.0, MOST, 150 if by_episodes else None)
+    run = Pooled(named, {"seeds": SEEDS}, MOST, 150 if by_episodes else None)
     (found,) = (one for one in verdicts.judge([run]) if one.name == claim)
     return found
 
@@ -233,8 +233,8 @@ def test_p_values_are_corrected_for_all_tests_of_the_page():
 
 
 def test_claims_about_episodes_are_read_off_runs_over_episodes():
-    steps = Pooled({("ddpg", 0): cell(1_000, expert=None)}, {}, 90.0, MOST, None)
-    episodes = Pooled({("ddpg", 0): cell(12_000, expert=None)}, {}, 90.0, MOST, 150)
+    steps = Pooled({("ddpg", 0): cell(1_000, expert=None)}, {}, MOST, None)
+    episodes = Pooled({("ddpg", 0): cell(12_000, expert=None)}, {}, MOST, 150)
     for runs in ([steps, episodes], [episodes, steps]):
         (found,) = (claim for claim in verdicts.judge(runs) if claim.name == "C4")
         assert found.verdict == "supported"
@@ -244,9 +244,8 @@ def test_cells_without_a_common_seed_are_not_compared():
     runs = Pooled(
         {("ddpg", 0): cell(studies=(0,)), ("hs-ddpg", 200): cell(studies=(1,))},
         {},
-        90.0,
         MOST,
-        False,
+        None,
     )
     (found,) = (claim for claim in verdicts.judge([runs]) if claim.name == "C3")
     assert found.verdict == "not testable"
@@ -261,8 +260,8 @@ def test_methods_are_compared_at_a_number_of_demonstrations_that_both_have():
 
 
 def test_of_runs_that_both_have_the_cells_the_one_with_more_seeds_is_read():
-    few = Pooled({("ddpg", 0): cell(1_000)}, {}, 90.0, MOST, None)
-    many = Pooled({("ddpg", 0): cell(12_000, studies=(0, 1))}, {}, 90.0, MOST, None)
+    few = Pooled({("ddpg", 0): cell(1_000)}, {}, MOST, None)
+    many = Pooled({("ddpg", 0): cell(12_000, studies=(0, 1))}, {}, MOST, None)
     for runs in ([few, many], [many, few]):
         (found,) = (claim for claim in verdicts.judge(runs) if claim.name == "C4")
         assert found.verdict == "supported"
@@ -280,6 +279,6 @@ def test_c1_of_seeds_without_known_experts_says_so():
 
 
 def test_a_seed_that_converged_at_its_last_evaluation_has_not_dipped():
-    run = Pooled({}, {}, 90.0, MOST, None)
+    run = Pooled({}, {}, MOST, None)
     assert set(DIPS.of(cell(MOST), run)) == {0.0}
     assert set(DIPS.of(cell(None), run)) == {1.0}

@@ -61,6 +61,29 @@ def test_where_no_pair_differs_the_unseen_differences_have_an_exact_bound():
     assert found(100, np.inf, 500.0) == "inconclusive"
 
 
+def test_a_cluster_that_differs_both_ways_differs_once():
+    clusters = np.repeat(np.arange(20), 5)
+    difference = np.zeros(100)
+    for cluster in range(5):
+        difference[5 * cluster : 5 * cluster + 2] = 0.02, -0.02
+    found = paired.compare(difference, np.zeros(100), clusters, span=1.0)
+    assert paired.equivalence(found, 0.02) == "inconclusive"
+
+
+def test_a_large_cluster_may_be_the_one_that_differs():
+    """Sixty clusters; those that differ, one in twenty, have fifty pairs, the others one."""
+
+    def bounded(trial):
+        differs = np.random.default_rng(trial).random(60) < 0.05
+        sizes = np.where(differs, 50, 1)
+        clusters = np.repeat(np.arange(60), sizes)
+        difference = np.repeat(differs.astype(float), sizes)
+        found = paired.compare(difference, np.zeros(difference.size), clusters, span=1.0)
+        return found.narrow.high >= (0.05 * 50) / (0.05 * 50 + 0.95)
+
+    assert np.mean([bounded(trial) for trial in range(100)]) >= 0.9
+
+
 def test_shares_on_the_margin_are_called_equivalent_in_at_most_a_twentieth():
     """One pair in fifty differs, all to one side."""
 

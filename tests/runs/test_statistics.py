@@ -194,6 +194,24 @@ def test_where_episodes_end_the_seeds_the_area_is_over_evaluations_by_episodes()
     assert found["area"] == pytest.approx(276 / 6)
 
 
+def test_a_seed_that_diverged_before_its_first_evaluation_by_episodes_leaves_the_others_areas():
+    rows = [
+        {"protocol": protocol, "seed": seed, "env_step": step, "episode": episode}
+        | {"return_mean": value}
+        for seed in range(3)
+        for protocol, own in {
+            "steps": [(0, 0, -30.0), (250, 1, 40.0)],
+            "episodes": [(250, 1, 90.0), (500, 2, 95.0)],
+        }.items()
+        for step, episode, value in own
+    ]
+    gone = [{"protocol": "steps", "seed": 3, "env_step": 0, "episode": 0, "return_mean": -40.0}]
+    found = statistics.of_seeds(
+        pl.DataFrame(rows + gone), np.array([False] * 3 + [True]), 90.0, by_episodes=True
+    )
+    np.testing.assert_allclose(found.area, [92.5, 92.5, 92.5, -40.0])
+
+
 def test_experts_that_seeds_share_are_paid_for_once():
     evaluations = evaluations_of([0, 92], [0, 92], [0, 92])
     seeds = seeds_table(3, expert_id=[4, 7, 4])

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from cmedirl_jax import networks, normalisation, training
-from cmedirl_jax.normalisation import STATISTICS
+from cmedirl_jax import networks, observation_statistics, training
+from cmedirl_jax.observation_statistics import STATISTICS, Statistics
 from cmedirl_jax.training.methods import METHODS
 from tests.support import pools, trainers
 
@@ -40,9 +40,10 @@ def test_without_demonstrations_they_are_those_of_the_observations_so_far():
     _, before, after = trained("ddpg")
     assert all(set(np.asarray(kept["std"])) == {1.0} for kept in of_networks(before))
     replay = after.storage[:STEPS]
-    # The first observation, and then what each step led to.
+    # The first observation, what each step led to, and the start of the second episode.
     spec = UNBOUNDED.spec
-    seen = np.concatenate([[before.observation], np.asarray(_next_observations(replay, spec))])
+    second = replay[trainers.LIMIT : trainers.LIMIT + 1, : spec.observation_dim]
+    seen = np.concatenate([[before.observation], _next_observations(replay, spec), second])
     for kept in of_networks(after):
         np.testing.assert_allclose(kept["mean"], seen.mean(axis=0), rtol=1e-4, atol=1e-6)
         np.testing.assert_allclose(kept["std"], seen.std(axis=0), rtol=1e-3)
@@ -74,7 +75,7 @@ def test_evaluation_uses_the_policys_own_and_leaves_them():
     kept = after.agent.actor[STATISTICS]
     found = trainer.act(after.agent.actor, observation)
     made = networks.make(UNBOUNDED.spec, trainers.SMALL.architecture)
-    plain = normalisation.put(after.agent.actor, normalisation.Statistics(np.zeros(2), np.ones(2)))
+    plain = observation_statistics.put(after.agent.actor, Statistics(np.zeros(2), np.ones(2)))
     scaled = (observation - kept["mean"]) / kept["std"]
     np.testing.assert_allclose(found, networks.policy(made, plain, scaled), rtol=1e-5)
 
@@ -96,4 +97,10 @@ def test_the_bounded_task_needs_none():
     trainer = training.make(pools.ENV, METHODS["ddpg"], trainers.SMALL, capacity=100)
     state = trainer.init(jax.random.key(0), None, 0)
     assert state.observation_statistics is None
-    assert not normalisation.kept((state.agent.actor, state.agent.critic))
+    assert not observation_statistics.kept((state.agent.actor, state.agent.critic))
+
+
+def test_statistics_are_of_32_bits_under_x64_too():
+    with jax.enable_x64(True):
+        params = networks.make(UNBOUNDED.spec).actor.init(jax.random.key(0))
+    assert {leaf.dtype for leaf in params[STATISTICS].values()} == {np.dtype(np.float32)}

@@ -67,8 +67,8 @@ def make_pool(
     # Choose who demonstrates, by the final policies' returns.
     returns = _final_returns(result)
     if threshold is None:
-        random = scale.random_return(env, EVALUATION_STARTS)
-        threshold = scale.solved(random, max(returns.max(), random))
+        best = float(returns.max())
+        threshold = cluster.from_writer(lambda: _better_than_random(env, best))
     chosen = choose(returns, options.which, threshold)
     if not chosen.size:
         raise UserError(
@@ -94,17 +94,23 @@ def make_pool(
     metadata["expert_returns"] = np.asarray(scores, float).tolist()
     shared = 1 if options.which == "each" else chosen.size
     per_expert = -(-options.trajectories // shared)
+    # An expert's episodes do not depend on who else demonstrates.
+    keys = [jax.random.fold_in(start_key, int(expert)) for expert in chosen]
 
     def recorded() -> Demonstrations:
         with phase("demonstrations"):
-            # An expert's episodes do not depend on who else demonstrates.
-            keys = [jax.random.fold_in(start_key, int(expert)) for expert in chosen]
             return recording.record_all(evaluator.act, env, actors, keys, per_expert, metadata)
 
     # On one process for all: rounding on another machine might give other episodes.
     pool = cluster.pool_from_writer(recorded)
     assert pool is not None
     return pool
+
+
+def _better_than_random(env: Env, best: float) -> float:
+    """The return that counts as solved; inf if the best expert is no better than random actions."""
+    random = scale.random_return(env, EVALUATION_STARTS)
+    return scale.solved(random, best) if best > random else np.inf
 
 
 def _final_returns(result: CellResult) -> np.ndarray:

@@ -15,6 +15,7 @@ from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env, Step
 from cmedirl_jax.runs.cells import recording
+from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.training import evaluation
 
 SOLVED = 0.9
@@ -51,11 +52,20 @@ def measure(env: Env, pool: Demonstrations, starts: int) -> Scale:
         pool: whose metadata name the `expert_returns`; else the mean return of its episodes stands
             for the best expert's.
         starts: the number of evaluation starts.
+
+    Raises:
+        UserError: if the task has no threshold, and the best expert is no better than random
+            actions.
     """
-    returns = pool.metadata.get("expert_returns", [])
-    expert = float(max(returns, default=demonstrations_lib.returns(pool).mean()))
-    random = random_return(env, starts)
+    named = np.array(pool.metadata.get("expert_returns", []), float)
+    returns = named if np.isfinite(named).any() else demonstrations_lib.returns(pool).mean()
+    expert, random = float(np.nanmax(returns)), random_return(env, starts)
     threshold = env.spec.reward_threshold
+    if threshold is None and not expert > random:
+        raise UserError(
+            f"--demos: they return {expert:.4g}, random actions {random:.4g}: nothing says what "
+            f"counts as solved in {env.spec.id}"
+        )
     return Scale(
         random=random,
         expert=expert,

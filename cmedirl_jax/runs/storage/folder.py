@@ -196,7 +196,9 @@ def solved(folder: Path, written: dict[str, Any]) -> float:
             return float(found)
     except (LookupError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
-        raise UserError(f"{folder}: config.json names no task and no scale ({reason})") from error
+        raise UserError(
+            f"{folder / 'config.json'} is not a readable configuration ({reason})"
+        ) from error
     raise UserError(f"{folder}: its task has no threshold, and its experts are not trained yet")
 
 
@@ -285,7 +287,8 @@ def flat(nested: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     values = {}
     for name, value in nested.items():
         if isinstance(value, dict):
-            values |= flat(value, "" if name == "settings" else f"{prefix}{name}.")
+            # The learners' settings are options of the command's first level.
+            values |= flat(value, "" if f"{prefix}{name}" == "settings" else f"{prefix}{name}.")
         else:
             values[prefix + name] = value
     return values

@@ -5,6 +5,7 @@ import pytest
 
 from cmedirl_jax import envs
 from cmedirl_jax.runs.cells import scale
+from cmedirl_jax.runs.errors import UserError
 from tests.support import pools
 
 PENDULUM = envs.make("Pendulum-v1")
@@ -65,3 +66,19 @@ def test_the_spread_is_of_single_steps():
     )
     # 0.1 a^2 with a uniform has a deviation of 0.03; random actions hardly ever reach the goal.
     assert found.reward_spread_random == pytest.approx(0.03, abs=0.02)
+
+
+def test_demonstrations_that_are_no_better_than_random_actions_say_nothing():
+    pool = pools.scripted(3)
+    env = pools.ENV._replace(spec=pools.ENV.spec._replace(reward_threshold=None))
+    worse = pool._replace(metadata=pool.metadata | {"expert_returns": [-500.0]})
+    with pytest.raises(UserError, match="--demos: they return -500, random actions"):
+        scale.measure(env, worse, 2)
+    assert scale.measure(pools.ENV, worse, 2).solved == 90.0
+
+
+@pytest.mark.parametrize("unknown", [[float("nan")], [None], []])
+def test_returns_that_are_not_known_are_those_of_the_episodes(unknown):
+    pool = pools.scripted(3)
+    unnamed = pool._replace(metadata=pool.metadata | {"expert_returns": unknown})
+    assert 90 < scale.measure(pools.ENV, unnamed, 2).expert < 100
