@@ -18,6 +18,7 @@ Tasks and data
 
 The agent
     networks: the actor and the critic.
+    observation_statistics: what observations without bounds are normalised by.
     ddpg: deep deterministic policy gradient.
     exploration: behaviour policies and their densities.
     hot_start: the hot start of actor and critic from demonstrations (Eq. 11).
@@ -41,7 +42,7 @@ Types
     EnvSpec, Transition, RewardBatch, Network.
 """
 
-from cmedirl_jax import envs, irl, networks, tabular, training
+from cmedirl_jax import envs, irl, networks, observation_statistics, tabular, training
 from cmedirl_jax.agents import ddpg, exploration, hot_start
 from cmedirl_jax.data import demonstrations, episodes, replay
 from cmedirl_jax.io import checkpoint
@@ -71,6 +72,7 @@ __all__ = [
     "hot_start",
     "irl",
     "networks",
+    "observation_statistics",
     "replay",
     "rewards",
     "schedules",
