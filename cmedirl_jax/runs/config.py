@@ -50,7 +50,7 @@ class Experts(NamedTuple):
     seeds: int
     steps: int
     trajectories: int
-    settings: Settings
+    settings: Settings = Settings()
 
 
 @dataclasses.dataclass(frozen=True)
