@@ -123,7 +123,8 @@ def refused(main, tmp_path, capsys):
         ),
         (
             "--env Walker2d-v5",
-            "--env: unknown environment 'Walker2d-v5'; there are: MountainCarContinuous-v0",
+            "--env: unknown environment 'Walker2d-v5'; there are: MountainCarContinuous-v0, "
+            "Pendulum-v1, PointMass-v0",
         ),
         ("--agent.tau 0", "--agent.tau: must be above 0 and at most 1, got 0.0"),
         (
