@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 import scipy.stats
-import tyro
 from rich import box
 from rich.table import Table
 
 from cmedirl_jax.ranges import Size
 from cmedirl_jax.runs import intervals, paired
 from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.intervals import Interval
 from cmedirl_jax.runs.storage import outputs
 
@@ -63,9 +63,7 @@ class Row(NamedTuple):
 @ending.in_a_line("coverage")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    options = tyro.cli(
-        Options, prog="python -m benchmarks.coverage", description=__doc__, args=arguments
-    )
+    options = read(Options, "benchmarks.coverage", __doc__, arguments)
     outputs.check("out", options.out)
     table = pl.DataFrame([measured(row, options.trials) for row in rows()])
     screen.show(screen.console(), shown(table))

@@ -31,6 +31,7 @@ from typing import Annotated, Any
 import tyro
 
 from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
 from experiments import pooled, verdicts
@@ -56,9 +57,7 @@ class Options:
 @ending.in_a_line("claims")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    options = tyro.cli(
-        Options, prog="python -m experiments.claims", description=__doc__, args=arguments
-    )
+    options = read(Options, "experiments.claims", __doc__, arguments)
     outputs.check("out", options.out)
     if not options.folders:
         raise UserError("FOLDERS: give the folder of a run")

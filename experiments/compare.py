@@ -21,6 +21,7 @@ from rich.table import Table
 
 from cmedirl_jax.runs import paired
 from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
 from experiments import measures, pooled
@@ -48,9 +49,7 @@ class Options:
 @ending.in_a_line("compare")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    options = tyro.cli(
-        Options, prog="python -m experiments.compare", description=__doc__, args=arguments
-    )
+    options = read(Options, "experiments.compare", __doc__, arguments)
     outputs.check("out", options.out)
     if not options.folders:
         raise UserError("FOLDERS: give the folder of a run")

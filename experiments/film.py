@@ -17,10 +17,10 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from cmedirl_jax import ranges
 from cmedirl_jax.ranges import Count, Size
 from cmedirl_jax.runs import start
 from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.load import load_policy
 from cmedirl_jax.runs.storage import folder as run_folder
@@ -58,11 +58,7 @@ class Options:
 @ending.in_a_line("film")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    options = tyro.cli(
-        Options, prog="python -m experiments.film", description=__doc__, args=arguments
-    )
-    for name, wrong in ranges.out_of_range(options):
-        raise UserError(f"--{name}: {wrong}")
+    options = read(Options, "experiments.film", __doc__, arguments)
     outputs.check("out", options.out)
     task = run_folder.read(options.folder)["config"]["env"]
     # Frames are drawn in memory: no screen is looked for.

@@ -17,11 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import polars as pl
-import tyro
 from rich import box
 from rich.table import Table
 
-from cmedirl_jax import envs, networks, observation_statistics, ranges
+from cmedirl_jax import envs, networks, observation_statistics
 from cmedirl_jax.agents import ddpg, hot_start
 from cmedirl_jax.agents.hot_start import HotStartData, HotStartHParams
 from cmedirl_jax.data import demonstrations
@@ -32,6 +31,7 @@ from cmedirl_jax.runs import intervals, start, validation
 from cmedirl_jax.runs.cells import pools
 from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.console import compile_cache, ending, screen
+from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
 from cmedirl_jax.training import evaluation
@@ -86,11 +86,7 @@ class Found(NamedTuple):
 @ending.in_a_line("hot_starts")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    options = tyro.cli(
-        Options, prog="python -m experiments.hot_starts", description=__doc__, args=arguments
-    )
-    for name, wrong in ranges.out_of_range(options):
-        raise UserError(f"--{name}: {wrong}")
+    options = read(Options, "experiments.hot_starts", __doc__, arguments)
     outputs.check("out", options.out)
     compile_cache.use_cache()
     start.devices()

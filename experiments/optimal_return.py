@@ -15,15 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import polars as pl
-import tyro
 from rich import box
 from rich.table import Table
 
-from cmedirl_jax import envs, ranges
+from cmedirl_jax import envs
 from cmedirl_jax.envs import Env
 from cmedirl_jax.ranges import AtLeastTwo, BelowOne, Size
 from cmedirl_jax.runs import start
 from cmedirl_jax.runs.console import compile_cache, ending, screen
+from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
 from cmedirl_jax.tabular import discretise, interpolation
@@ -55,7 +55,7 @@ class Options:
 @ending.in_a_line("optimal_return")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    options = tyro.cli(Options, prog="python -m experiments.optimal_return", args=arguments)
+    options = read(Options, "experiments.optimal_return", __doc__, arguments)
     compile_cache.use_cache()
     outputs.check("out", options.out)
     start.devices()
@@ -90,11 +90,9 @@ def optimal_returns(options: Options) -> pl.DataFrame:
     of the policy that looks one step ahead by it.
 
     Raises:
-        ValueError: for an unknown environment, one that cannot be discretised, a number out of
-            its range, or a grid that is too large.
+        ValueError: for an unknown environment, one that cannot be discretised, or a grid that is
+            too large.
     """
-    for name, wrong in ranges.out_of_range(options):
-        raise ValueError(f"--{name}: {wrong}")
     env = envs.make(options.env)
     spec, params = env.spec, env.default_params
     first = np.asarray(env.starts(options.starts, params)[1])

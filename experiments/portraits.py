@@ -16,11 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from cmedirl_jax import envs, ranges
+from cmedirl_jax import envs
 from cmedirl_jax.envs import Env
 from cmedirl_jax.ranges import AtLeastTwo, Size
 from cmedirl_jax.runs import drawing, start
 from cmedirl_jax.runs.console import compile_cache, ending, screen
+from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.drawing import Figure
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.load import load_policy
@@ -69,11 +70,7 @@ class ValueMap(NamedTuple):
 @ending.in_a_line("portraits")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    options = tyro.cli(
-        Options, prog="python -m experiments.portraits", description=__doc__, args=arguments
-    )
-    for name, wrong in ranges.out_of_range(options):
-        raise UserError(f"--{name}: {wrong}")
+    options = read(Options, "experiments.portraits", __doc__, arguments)
     if options.out.suffix not in (".png", ".svg"):
         raise UserError(f"--out: {options.out} is no PNG or SVG file")
     outputs.check("out", options.out)

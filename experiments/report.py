@@ -11,6 +11,7 @@ import tyro
 
 from cmedirl_jax.runs import statistics
 from cmedirl_jax.runs.console import ending, screen, streams
+from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.storage import cells, outputs, tables
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.training.methods import METHODS
@@ -32,9 +33,7 @@ class Options:
 @ending.in_a_line("report")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code, 1 if a figure could not be drawn."""
-    options = tyro.cli(
-        Options, prog="python -m experiments.report", description=__doc__, args=arguments
-    )
+    options = read(Options, "experiments.report", __doc__, arguments)
     folder = options.folder
     run_folder.read(folder)
     with run_folder.held(folder):

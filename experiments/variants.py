@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
-import tyro
 from rich import box
 from rich.table import Table
 
 from cmedirl_jax.ranges import Size
 from cmedirl_jax.runs import paired
 from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
 from experiments import measures, pooled, run_grid
@@ -115,9 +115,7 @@ class Options:
 @ending.in_a_line("variants")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code, that of the first run that does not end well."""
-    options = tyro.cli(
-        Options, prog="python -m experiments.variants", description=__doc__, args=arguments
-    )
+    options = read(Options, "experiments.variants", __doc__, arguments)
     outputs.check("csv", options.csv)
     chosen = chosen_of(options.only)
     for variant in chosen:
