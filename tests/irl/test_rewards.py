@@ -1,6 +1,7 @@
 import itertools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -100,9 +101,12 @@ def test_features_need_resolution_and_finite_bounds(spec):
     with pytest.raises(ValueError, match="order of one or more, got 0"):
         rewards.fourier(spec, 0)
     endless = spec._replace(observation_high=np.float32([np.inf, 1.0]))
-    for make, size in ((rewards.mlp, (3,)), (rewards.fourier, 3), (rewards.radial_basis, 3)):
+    for make in (rewards.fourier, rewards.radial_basis):
         with pytest.raises(ValueError, match="finite bounds"):
-            make(endless, size, "state")
+            make(endless, 3, "state")
+    # A perceptron takes statistics in their place.
+    network = rewards.mlp(endless, (3,), "state")
+    assert network.apply(network.init(jax.random.key(0)), jnp.ones(2), jnp.ones(1)).shape == ()
 
 
 def test_features_that_are_a_power_are_refused_before_they_are_made(spec):
