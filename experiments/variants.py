@@ -62,6 +62,7 @@ VARIANTS = (
             "transition-fusion": "--reward.objective transition "
             "--reward-batches.weights fusion --reward.weight-limit 3",
             "trajectory": "--reward.objective trajectory",
+            "trajectory-large": "--reward.objective trajectory --reward.bound 0.3",
             "zero-mean": "--reward.gauge zero-mean",
             "absorbing": "--reward.absorbing",
             "state": "--reward-network.inputs state",
