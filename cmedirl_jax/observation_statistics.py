@@ -38,20 +38,17 @@ def put(params: Any, statistics: Statistics) -> Any:
     """Parameters, or a tree of them, with the statistics of every network in it replaced."""
 
     def replaced(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
-        names = [getattr(key, "key", None) for key in path]
-        if STATISTICS not in names:
+        if STATISTICS not in _names(path):
             return leaf
-        return jnp.asarray(getattr(statistics, str(names[-1])), leaf.dtype)
+        return jnp.asarray(getattr(statistics, path[-1].key), leaf.dtype)
 
     return jax.tree_util.tree_map_with_path(replaced, params)
 
 
 def kept(params: Any) -> bool:
     """Whether a network in a tree of parameters keeps statistics."""
-    return any(
-        STATISTICS in [getattr(key, "key", None) for key in path]
-        for path, _ in jax.tree_util.tree_flatten_with_path(params)[0]
-    )
+    leaves, _ = jax.tree_util.tree_flatten_with_path(params)
+    return any(STATISTICS in _names(path) for path, _ in leaves)
 
 
 def trained(params: Any) -> Any:
@@ -67,10 +64,14 @@ def fixed(updates: Any) -> Any:
     """An optimiser's updates without those of `FIXED` parameters, which weight decay would move."""
 
     def kept_still(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
-        names = [getattr(key, "key", None) for key in path]
-        return jnp.zeros_like(leaf) if any(name in FIXED for name in names) else leaf
+        return leaf if _names(path).isdisjoint(FIXED) else jnp.zeros_like(leaf)
 
     return jax.tree_util.tree_map_with_path(kept_still, updates)
+
+
+def _names(path: tuple[Any, ...]) -> set[Any]:
+    """The names of the mappings that lead to a leaf."""
+    return {getattr(key, "key", None) for key in path}
 
 
 def of_sample(observation: Array) -> Statistics:

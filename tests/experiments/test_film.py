@@ -5,20 +5,12 @@ import pytest
 from PIL import Image
 
 from experiments import film
-from tests.support import runs
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    runs.save(folder)
-    return folder
-
-
-def test_the_command_films_an_episode(run, tmp_path, capsys):
+def test_the_command_films_an_episode(untrained_run, tmp_path, capsys):
     out = tmp_path / "film.gif"
     options = ["--method", "hs-ddpg", "--n-demos", "7", "--every", "400", "--width", "60"]
-    assert film.main([str(run), *options, "--out", str(out)]) == 0
+    assert film.main([str(untrained_run), *options, "--out", str(out)]) == 0
     # An untrained policy: the start, steps 400 and 800, and the end at 999.
     assert capsys.readouterr().out == f"Film: {out}, 4 frames\n"
     with Image.open(out) as picture:
@@ -49,8 +41,8 @@ def test_a_gif_holds_every_frame():
         (["{run}", "--every", "0"], "--every: must be at least 1, got 0"),
     ],
 )
-def test_mistakes_are_refused_in_a_line(run, arguments, named, capsys):
-    assert film.main([argument.format(run=run) for argument in arguments]) == 2
+def test_mistakes_are_refused_in_a_line(untrained_run, arguments, named, capsys):
+    assert film.main([argument.format(run=untrained_run) for argument in arguments]) == 2
     error = capsys.readouterr().err
     assert named in error
     assert error.count("\n") == 1

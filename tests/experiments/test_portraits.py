@@ -4,19 +4,15 @@ import pytest
 
 from cmedirl_jax import envs
 from experiments import portraits
-from tests.support import pools, runs
+from tests.support import pools
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    runs.save(folder)
-    return folder
-
-
-def test_the_command_draws_a_panel_for_each_method(run, tmp_path, capsys):
+def test_the_command_draws_a_panel_for_each_method(untrained_run, tmp_path, capsys):
     out = tmp_path / "portraits.svg"
-    assert portraits.main([str(run), "--seeds", "2", "--states", "15", "--out", str(out)]) == 0
+    assert (
+        portraits.main([str(untrained_run), "--seeds", "2", "--states", "15", "--out", str(out)])
+        == 0
+    )
     text = out.read_text()
     assert text.startswith("<?xml")
     assert capsys.readouterr().out == f"Portraits: {out}\n"
@@ -66,8 +62,8 @@ def test_another_number_of_observations_cannot_be_drawn():
         (["{run}", "--states", "1"], "--states: must be at least 2, got 1"),
     ],
 )
-def test_mistakes_are_refused_in_a_line(run, arguments, named, capsys):
-    assert portraits.main([argument.format(run=run) for argument in arguments]) == 2
+def test_mistakes_are_refused_in_a_line(untrained_run, arguments, named, capsys):
+    assert portraits.main([argument.format(run=untrained_run) for argument in arguments]) == 2
     error = capsys.readouterr().err
     assert named in error
     assert error.count("\n") == 1

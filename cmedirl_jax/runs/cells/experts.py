@@ -1,6 +1,7 @@
 """Demonstrations as in the paper: by DDPG experts trained on the true reward (section 4.1)."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -69,13 +70,13 @@ def make_pool(
     if threshold is None:
         best = float(returns.max())
         threshold = cluster.from_writer(lambda: _better_than_random(env, best))
-    chosen = choose(returns, options.which, threshold)
-    if not chosen.size:
-        raise UserError(
-            f"--experts: none of {options.seeds} experts reached a return of {threshold:g} in "
-            f"{options.steps} steps; give them more steps (--experts.steps) or seeds, "
-            "and the run another folder"
-        )
+    chosen = _chosen(returns, options, threshold)
+
+    # Evaluate them as learners are, and record them.
+    actors = jax.tree.map(lambda leaf: leaf[chosen], result.final)
+    evaluator = programs.evaluator
+    with phase("evaluation"):
+        scores = evaluator.summarise(evaluator.on_starts(actors, evaluation_starts)).return_mean
     metadata = {
         "env": env.spec.id,
         "source": "noise-free trajectories of DDPG experts trained on the true reward",
@@ -84,27 +85,44 @@ def make_pool(
         "experts_solved": int((returns >= threshold).sum()),
         "experts_demonstrating": chosen.tolist(),
         "expert_env_steps": int(result.env_steps.sum()),
+        "expert_returns": np.asarray(scores, float).tolist(),
     }
-
-    # Evaluate them as learners are, and record them.
-    evaluator = programs.evaluator
-    actors = jax.tree.map(lambda leaf: leaf[chosen], result.final)
-    with phase("evaluation"):
-        scores = evaluator.summarise(evaluator.on_starts(actors, evaluation_starts)).return_mean
-    metadata["expert_returns"] = np.asarray(scores, float).tolist()
-    shared = 1 if options.which == "each" else chosen.size
-    per_expert = -(-options.trajectories // shared)
-    # An expert's episodes do not depend on who else demonstrates.
-    keys = [jax.random.fold_in(start_key, int(expert)) for expert in chosen]
-
-    def recorded() -> Demonstrations:
-        with phase("demonstrations"):
-            return recording.record_all(evaluator.act, env, actors, keys, per_expert, metadata)
-
     # On one process for all: rounding on another machine might give other episodes.
-    pool = cluster.pool_from_writer(recorded)
+    pool = cluster.pool_from_writer(
+        lambda: _record(start_key, env, options, programs, actors, metadata)
+    )
     assert pool is not None
     return pool
+
+
+def _chosen(returns: np.ndarray, options: Experts, threshold: float) -> np.ndarray:
+    """Who demonstrates; a `UserError` if nobody can."""
+    chosen = choose(returns, options.which, threshold)
+    if not chosen.size:
+        raise UserError(
+            f"--experts: none of {options.seeds} experts reached a return of {threshold:g} in "
+            f"{options.steps} steps; give them more steps (--experts.steps) or seeds, "
+            "and the run another folder"
+        )
+    return chosen
+
+
+def _record(
+    key: jax.Array,
+    env: Env,
+    options: Experts,
+    programs: CompiledMethod,
+    actors: Any,
+    metadata: dict[str, Any],
+) -> Demonstrations:
+    """Record the trajectories of those who demonstrate, actors `[experts, ...]`."""
+    experts = metadata["experts_demonstrating"]
+    shared = 1 if options.which == "each" else len(experts)
+    per_expert = -(-options.trajectories // shared)
+    # An expert's episodes do not depend on who else demonstrates.
+    keys = [jax.random.fold_in(key, expert) for expert in experts]
+    with phase("demonstrations"):
+        return recording.record_all(programs.evaluator.act, env, actors, keys, per_expert, metadata)
 
 
 def _better_than_random(env: Env, best: float) -> float:
