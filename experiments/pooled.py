@@ -102,7 +102,7 @@ def lifetime(config: dict[str, Any]) -> Lifetime:
     episodes, steps = config["max_episodes"], config["max_steps"]
     if episodes is None:
         return Lifetime(int(steps), None, False)
-    longest = episodes * envs.make(config["env"]).spec.max_episode_steps
+    longest = episodes * envs.find(config["env"]).spec.max_episode_steps
     if steps is None or longest <= steps:
         return Lifetime(int(longest), episodes, False)
     return Lifetime(int(steps), None, True)

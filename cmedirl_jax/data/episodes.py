@@ -40,6 +40,8 @@ class Episodes(NamedTuple):
         step: `(state, step, done) -> EpisodesState`, to call after transition number `step` `[]`
             int32 was added to the replay; `done` `[]` bool says whether it ended an episode. Raises
             ValueError for wrong shapes and TypeError for wrong dtypes.
+        cut: `(state, step) -> EpisodesState`: the next transition is number `step` and begins an
+            episode; the running one is dropped.
         take: `(state, bits [M], steps, recent=None) -> (rows [M, T], mask [M, T])`, M episodes
             drawn uniformly with replacement, as rows of the replay's storage, after `steps`
             transitions were added. `recent` restricts them to episodes that lie within so many
@@ -49,6 +51,7 @@ class Episodes(NamedTuple):
 
     init: Callable[[], EpisodesState]
     step: Callable[[EpisodesState, jax.Array, jax.Array], EpisodesState]
+    cut: Callable[[EpisodesState, jax.Array], EpisodesState]
     take: Callable[..., tuple[jax.Array, jax.Array]]
 
 
@@ -68,6 +71,7 @@ def make(capacity: int, replay_capacity: int, max_length: int) -> Episodes:
     return Episodes(
         init=functools.partial(_init, capacity),
         step=functools.partial(_step, capacity),
+        cut=lambda state, step: state.replace(current=jnp.asarray(step, jnp.int32)),
         take=functools.partial(_take, capacity, replay_capacity, max_length),
     )
 

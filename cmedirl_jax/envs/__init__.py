@@ -1,9 +1,29 @@
-"""Environments as pure functions."""
+"""Tasks: environments as pure functions, and Gymnasium's, both ways."""
 
+from cmedirl_jax.envs import registration as registration
+from cmedirl_jax.envs import wrappers
 from cmedirl_jax.envs.base import Env, Step
 from cmedirl_jax.envs.brax import from_brax
+from cmedirl_jax.envs.gymnasium_env import to_gymnasium
+from cmedirl_jax.envs.gymnasium_vector import to_gymnasium_vector
 from cmedirl_jax.envs.gymnax import from_gymnax
-from cmedirl_jax.envs.registry import ENVS, make, register
+from cmedirl_jax.envs.host import HostEnv, from_gymnasium
+from cmedirl_jax.envs.registry import ENVS, find, make, register
 from cmedirl_jax.envs.validation import check
 
-__all__ = ["ENVS", "Env", "Step", "check", "from_brax", "from_gymnax", "make", "register"]
+__all__ = [
+    "ENVS",
+    "Env",
+    "HostEnv",
+    "Step",
+    "check",
+    "find",
+    "from_brax",
+    "from_gymnasium",
+    "from_gymnax",
+    "make",
+    "register",
+    "to_gymnasium",
+    "to_gymnasium_vector",
+    "wrappers",
+]

@@ -20,10 +20,10 @@ class Step(NamedTuple):
         truncated: `[]` bool, the time limit was reached (values still bootstrap). Both may be True.
     """
 
-    observation: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
+    observation: Any
+    reward: Any
+    terminated: Any
+    truncated: Any
 
 
 class ResetFn(Protocol):

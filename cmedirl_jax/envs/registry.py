@@ -1,9 +1,12 @@
-"""The environments, by Gymnasium's names."""
+"""The environments in JAX, by Gymnasium's names."""
 
 from collections.abc import Callable
 
+import gymnasium
+
 from cmedirl_jax.envs import mountain_car, pendulum, point_mass
 from cmedirl_jax.envs.base import Env
+from cmedirl_jax.envs.host import HostEnv, from_gymnasium
 from cmedirl_jax.registries import Registry
 
 ENVS: Registry[Callable[[], Env]] = Registry(
@@ -28,6 +31,30 @@ def make(id: str) -> Env:
     if env.spec.id != id:
         raise ValueError(f"environment {id!r}: the id in its specification is {env.spec.id!r}")
     return env
+
+
+def find(id: str, *, asynchronous: bool = False) -> Env | HostEnv:
+    """Make an environment of this library, or else Gymnasium's of that name.
+
+    `gymnasium:Pendulum-v1` is Gymnasium's, in Gymnasium's way to name a module that has it.
+
+    Args:
+        id: the name.
+        asynchronous: see `from_gymnasium`.
+
+    Raises:
+        ValueError: if neither knows the name, something that the task needs is not installed, or as
+            `make` and `from_gymnasium`.
+    """
+    if id in ENVS:
+        return make(id)
+    try:
+        return from_gymnasium(id, asynchronous=asynchronous)
+    except (gymnasium.error.Error, ImportError) as error:
+        ours, reason = ", ".join(ENVS), " ".join(str(error).split())
+        raise ValueError(
+            f"unknown environment {id!r}; there are: {ours}, and Gymnasium's, which says: {reason}"
+        ) from error
 
 
 def register(id: str, make: Callable[[], Env]) -> None:

@@ -90,6 +90,8 @@ class RewardSampler(NamedTuple):
         init: `(key, actor, pool, subset) -> SamplerState`.
         record: `(state, actor, step, log_density, ended) -> SamplerState`, after transition
             number `step` (unbatched under `vmap`) was added to the replay.
+        cut: `(state, step) -> SamplerState`: transition number `step` will begin an episode, though
+            none has ended.
         take: `(state, pool, subset, replay_state, exploration_state, draws) -> (demonstrations,
             background)`, two `RewardBatch`es for a `RewardLearner`.
     """
@@ -99,6 +101,7 @@ class RewardSampler(NamedTuple):
     choose: Callable[[jax.Array, DemonstrationSubset, jax.Array, int], jax.Array]
     init: Callable[..., SamplerState]
     record: Callable[..., SamplerState]
+    cut: Callable[[SamplerState, jax.Array], SamplerState]
     take: Callable[..., tuple[RewardBatch, RewardBatch]]
 
 
@@ -151,6 +154,7 @@ def make(
         choose=source.choose,
         init=functools.partial(_init, source=source, weights=weights),
         record=functools.partial(_record, source=source, weights=weights),
+        cut=lambda state, step: state.replace(source=source.cut(state.source, step)),
         take=functools.partial(_take, source=source, weights=weights),
     )
 

@@ -42,6 +42,8 @@ class SampleSource(NamedTuple):
         shares_pairs: whether `choose` takes the demonstrated pairs that it is given.
         init: `() -> state`, what is kept beside the replay; None if nothing is.
         record: `(state, step, ended) -> state`, after transition number `step` `[]` was added.
+        cut: `(state, step) -> state`: transition number `step` will begin an episode, though none
+            has ended.
         choose: `(key, subset, rows [n], count) -> [count] int32`, which demonstrations to take.
             `rows` are rows of the pool that were drawn for other uses too.
         demonstrations: `(pool, subset, chosen [B]) -> Samples`.
@@ -55,6 +57,7 @@ class SampleSource(NamedTuple):
     shares_pairs: bool
     init: Callable[[], Any]
     record: Callable[[Any, jax.Array, jax.Array], Any]
+    cut: Callable[[Any, jax.Array], Any]
     choose: Callable[[jax.Array, DemonstrationSubset, jax.Array, int], jax.Array]
     demonstrations: Callable[[Transition, DemonstrationSubset, jax.Array], Samples]
     background: Callable[[Any, ReplayState, jax.Array], Samples]
@@ -75,6 +78,7 @@ def pairs(replay: Replay, batch_size: int, recent: int | None) -> SampleSource:
         shares_pairs=True,
         init=lambda: None,
         record=lambda state, step, ended: None,
+        cut=lambda state, step: None,
         choose=lambda key, subset, rows, count: rows[:count],
         demonstrations=_demonstrated_pairs,
         background=functools.partial(_background_pairs, replay=replay, recent=recent),
@@ -131,6 +135,7 @@ def trajectories(
         shares_pairs=False,
         init=ring.init,
         record=ring.step,
+        cut=ring.cut,
         choose=lambda key, subset, rows, count: demonstrations_lib.sample_episodes(
             key, subset, count
         ),

@@ -85,7 +85,10 @@ class StudyConfig:
             the task can be set to an observation; spec: the task's name and bounds, and that steps
             follow each other, for tasks that draw random numbers; none: the task's sizes, for
             noisy demonstrations or those of another task.
-        env: The task, by its name; under tuned it brings settings of its own, where it has some.
+        env: The task, by its name: one of this library's, or else Gymnasium's, MODULE:NAME too;
+            under tuned it brings settings of its own, where it has some.
+        asynchronous: Step each learner's copy of a task of Gymnasium's in a process of its own,
+            for tasks whose steps take longer than some 0.1 ms.
         devices: CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU.
             With several processes, of each of them.
         group: Seeds that a device steps together; default: what is fastest for the networks' width.
@@ -116,6 +119,7 @@ class StudyConfig:
     demos: Path | None = None
     check_demos: DemosCheck = "dynamics"
     env: str = "MountainCarContinuous-v0"
+    asynchronous: bool = False
     devices: Size | None = None
     group: Size | None = None
     distributed: bool = False

@@ -13,7 +13,7 @@ from cmedirl_jax import checks, envs, networks, ranges
 from cmedirl_jax.agents.exploration import ExplorationSettings
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
-from cmedirl_jax.envs import Env
+from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.runs.cells import pools
 from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.cells.record import Budget
@@ -50,7 +50,7 @@ class Plan(NamedTuple):
 
     folder: Path
     config: dict[str, Any]
-    env: Env
+    env: Env | HostEnv
     study: int
     asked: list[tuple[str, int]]
     seeds: int
@@ -97,7 +97,9 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool =
         UserError: naming the option, what is wrong and what would be right.
     """
     check(config)
-    env = envs.make(config.env)
+    env = envs.find(config.env, asynchronous=config.asynchronous)
+    if isinstance(env, HostEnv) and config.cluster.several:
+        raise UserError(f"--env: {config.env} is stepped on one host; leave --processes")
     path, demos = config.demos, None
     if path is not None:
         demos = cluster.pool_from_writer(lambda: load_demonstrations(path, env, config.check_demos))
@@ -133,7 +135,7 @@ def describe(config: StudyConfig) -> dict[str, Any]:
     return described
 
 
-def budget_of(config: StudyConfig, env: Env) -> Budget:
+def budget_of(config: StudyConfig, env: Env | HostEnv) -> Budget:
     """How long each learner trains."""
     most = [config.max_steps]
     if config.max_episodes is not None:
@@ -159,8 +161,9 @@ def check(config: StudyConfig) -> None:
         if method not in METHODS:
             raise UserError(f"--methods: unknown method {method!r}; there are {', '.join(METHODS)}")
     try:
-        env = envs.make(config.env)
-        envs.check(env, steps=0)
+        env = envs.find(config.env)
+        if isinstance(env, Env):
+            envs.check(env, steps=0)
     except (TypeError, ValueError) as error:
         raise UserError(f"--env: {error}") from error
     for name in ("methods", "n_demos"):
@@ -184,13 +187,16 @@ def check(config: StudyConfig) -> None:
         _check_enough(asked, config.resolved_experts.trajectories)
 
 
-def _check_parts(config: StudyConfig, env: Env, capacity: int) -> None:
+def _check_parts(config: StudyConfig, env: Env | HostEnv, capacity: int) -> None:
     try:
         networks.make(env.spec, config.settings.architecture)
     except ValueError as error:
         raise UserError(f"--architecture: {error}") from error
     tabular = config.settings.tabular
-    if any(METHODS[name].tabular for name in config.methods):
+    of_grids = [name for name in config.methods if METHODS[name].tabular]
+    if of_grids and isinstance(env, HostEnv):
+        raise UserError(f"--methods {of_grids[0]}: it needs a task in JAX, {config.env} is not")
+    if of_grids and isinstance(env, Env):
         try:
             jax.eval_shape(lambda: imitation.discretised(env, tabular))
             for name in config.methods:
@@ -239,7 +245,7 @@ def _check_epsilon(settings: ExplorationSettings) -> None:
         raise UserError(f"--exploration.hot-start-factor: makes epsilon {largest:g}, above 1")
 
 
-def load_demonstrations(path: Path, env: Env, check: DemosCheck) -> Demonstrations:
+def load_demonstrations(path: Path, env: Env | HostEnv, check: DemosCheck) -> Demonstrations:
     """Read the file that `--demos` names.
 
     Args:

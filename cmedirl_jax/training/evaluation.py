@@ -19,9 +19,9 @@ class Rollouts(NamedTuple):
         terminated: `[B]` bool; for a goal-reaching task, whether the goal was reached.
     """
 
-    episode_return: jax.Array
-    length: jax.Array
-    terminated: jax.Array
+    episode_return: Any
+    length: Any
+    terminated: Any
 
 
 class Evaluation(NamedTuple):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from cmedirl_jax import checks
 from cmedirl_jax.agents import hot_start
+from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env
@@ -18,6 +19,7 @@ from cmedirl_jax.training.methods import METHODS, Method
 from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.training.step import Log
 from cmedirl_jax.training.trainer import make
+from cmedirl_jax.types import EnvSpec
 
 
 class Result(NamedTuple):
@@ -32,6 +34,55 @@ class Result(NamedTuple):
     states: TrainingState
     evaluations: Evaluation
     episodes: Log
+
+
+class Prepared(NamedTuple):
+    """What a call of `fit` asks for, checked.
+
+    Attributes:
+        method: the method.
+        settings: every other choice.
+        data: the demonstrations; None for a method without.
+        n_demonstrations: episodes that each learner draws.
+    """
+
+    method: Method
+    settings: Settings
+    data: HotStartData | None
+    n_demonstrations: int
+
+
+def prepare(
+    spec: EnvSpec,
+    method: Method | str,
+    demonstrations: Demonstrations | None,
+    n_demonstrations: int | None,
+    settings: Settings | None,
+    *,
+    seeds: int,
+    steps: int,
+    evaluate_every: int,
+    evaluation_starts: int,
+) -> Prepared:
+    """Check the arguments of `fit`, which describes them."""
+    if isinstance(method, str):
+        method = METHODS[method]
+    checks.sizes(
+        seeds=seeds,
+        steps=steps,
+        evaluate_every=evaluate_every,
+        evaluation_starts=evaluation_starts,
+    )
+    if steps % evaluate_every:
+        raise ValueError(f"steps ({steps}) must be a multiple of evaluate_every ({evaluate_every})")
+    settings = settings or Settings()
+    data, n = None, 0
+    if demonstrations is not None and method.uses_demonstrations:
+        demonstrations_lib.validate(demonstrations, spec)
+        agent = settings.agent
+        data = hot_start.data(demonstrations, agent.discount, agent.reward_scale)
+        n = len(data.episodes.start) if n_demonstrations is None else n_demonstrations
+    return Prepared(method, settings, data, n)
 
 
 def fit(
@@ -66,24 +117,18 @@ def fit(
             the environment, sizes that are not positive, `steps` that are no multiple of
             `evaluate_every`, or what `make` refuses.
     """
-    if isinstance(method, str):
-        method = METHODS[method]
-    checks.sizes(
+    task = prepare(
+        env.spec,
+        method,
+        demonstrations,
+        n_demonstrations,
+        settings,
         seeds=seeds,
         steps=steps,
         evaluate_every=evaluate_every,
         evaluation_starts=evaluation_starts,
     )
-    if steps % evaluate_every:
-        raise ValueError(f"steps ({steps}) must be a multiple of evaluate_every ({evaluate_every})")
-    settings = settings or Settings()
-    data, n = None, 0
-    if demonstrations is not None and method.uses_demonstrations:
-        demonstrations_lib.validate(demonstrations, env.spec)
-        agent = settings.agent
-        data = hot_start.data(demonstrations, agent.discount, agent.reward_scale)
-        n = len(data.episodes.start) if n_demonstrations is None else n_demonstrations
-    trainer = make(env, method, settings, capacity=steps)
+    trainer = make(env, task.method, task.settings, capacity=steps)
 
     def evaluate(state: TrainingState) -> Evaluation:
         return evaluation.evaluate(
@@ -94,11 +139,11 @@ def fit(
         )
 
     def learn(key: jax.Array) -> Result:
-        state = trainer.init(key, data, n)
+        state = trainer.init(key, task.data, task.n_demonstrations)
         first = evaluate(state)
 
         def chunk(state: TrainingState, steps: jax.Array):
-            state, log = trainer.run(state, data, steps)
+            state, log = trainer.run(state, task.data, steps)
             return state, (evaluate(state), log)
 
         chunks = jnp.arange(steps, dtype=jnp.int32).reshape(-1, evaluate_every)
@@ -106,7 +151,7 @@ def fit(
         evaluations = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), first, later)
         return Result(state, evaluations, jax.tree.map(lambda x: x.reshape(steps), log))
 
-    group = seeds_lib.group_size(seeds, hidden=settings.architecture.hidden)
+    group = seeds_lib.group_size(seeds, hidden=task.settings.architecture.hidden)
     keys = seeds_lib.keys(key, seeds_lib.padded(seeds, group))
     result = seeds_lib.map_groups(learn, group)(keys)
     return jax.tree.map(lambda x: x[:seeds], result)

@@ -14,7 +14,8 @@ from cmedirl_jax.agents.ddpg import DDPGState
 from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
-from cmedirl_jax.envs import Env
+from cmedirl_jax.envs import Env, HostEnv
+from cmedirl_jax.envs.base import Reset
 from cmedirl_jax.irl import RewardState
 from cmedirl_jax.irl.reward_batches import SamplerState
 from cmedirl_jax.observation_statistics import Running
@@ -74,11 +75,12 @@ class Initialisation(NamedTuple):
         hot_start: `(key, data, n_demonstrations, networks) -> networks`, the networks drawn after
             their hot start; as they are for a method without. Methods that share its settings share
             the result.
-        init: `(key, data, n_demonstrations, networks=None) -> TrainingState`, the fit of a tabular
-            reward included.
+        init: `(key, data, n_demonstrations, networks=None, start=None) -> TrainingState`, the fit
+            of a tabular reward included.
             `data` is what `hot_start.data` made of the pool, or None for methods without
             demonstrations; `networks` is what the two functions above gave, where they were called
-            apart.
+            apart; `start` is the first state and observation of the task, by default those that its
+            `reset` draws. A task on the host has no state here: `(None, observation)`.
     """
 
     draw_networks: Callable[[jax.Array], tuple[Params, Params]]
@@ -87,7 +89,7 @@ class Initialisation(NamedTuple):
 
 
 def make(
-    env: Env,
+    env: Env | HostEnv,
     method: Method,
     settings: Settings,
     algorithm: Algorithm,
@@ -107,7 +109,7 @@ def make(
 class _Parts(NamedTuple):
     """What the functions below are bound to."""
 
-    env: Env
+    env: Env | HostEnv
     env_params: Any
     method: Method
     settings: Settings
@@ -196,6 +198,7 @@ def _init(
     data: HotStartData | None,
     n_demonstrations: Numeric,
     networks: tuple[Params, Params] | None = None,
+    start: Reset | None = None,
 ) -> TrainingState:
     algorithm = parts.algorithm
     keys, steps_key = split(key)
@@ -220,7 +223,7 @@ def _init(
             )
 
     # The first episode.
-    env_state, observation = parts.env.reset(keys.env, parts.env_params)
+    env_state, observation = _first(parts, keys) if start is None else start
     running = None
     if observation_statistics.kept(networks) and not parts.method.uses_demonstrations:
         running = observation_statistics.begin(observation)
@@ -242,11 +245,18 @@ def _init(
     return modes.vary(state, key)
 
 
+def _first(parts: _Parts, keys: SeedKeys) -> Reset:
+    if isinstance(parts.env, HostEnv):
+        raise ValueError(f"{parts.env.spec.id} is stepped on the host: give init a start")
+    return parts.env.reset(keys.env, parts.env_params)
+
+
 def _fit_table(
     parts: _Parts, keys: SeedKeys, data: HotStartData, subset: DemonstrationSubset
 ) -> RewardState:
     """The reward that dynamic programming learns from the demonstrations."""
     assert parts.method.tabular is not None
+    assert isinstance(parts.env, Env)
     settings = parts.settings
     mdp = imitation.discretised(parts.env, settings.tabular, params=parts.env_params)
     fitted = imitation.fit(

@@ -39,5 +39,5 @@ TASKS: dict[str, TaskSettings] = {
 
 
 def of(task: str) -> TaskSettings:
-    """What works on a task, by its name."""
-    return TASKS.get(task, TaskSettings())
+    """What works on a task, by its name; `module:` before it does not matter."""
+    return TASKS.get(task.rpartition(":")[2], TaskSettings())

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from cmedirl_jax import envs
 from cmedirl_jax import networks as networks_lib
 from cmedirl_jax.agents.hot_start import HotStartData
-from cmedirl_jax.envs import Env
+from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.training import compose, initialise, schedules, updates
 from cmedirl_jax.training import step as step_lib
 from cmedirl_jax.training.compose import Algorithm
@@ -74,7 +74,7 @@ class Trainer(NamedTuple):
 
 
 def make(
-    env: Env,
+    env: Env | HostEnv,
     method: Method,
     settings: Settings | None = None,
     *,
@@ -85,7 +85,7 @@ def make(
     """Make a trainer.
 
     Args:
-        env: the environment.
+        env: the environment. One that is stepped on the host has no `run`: see `training.host`.
         method: one of `METHODS`, or your own.
         settings: every other choice.
         capacity: transitions in the replay where `settings.schedule` leaves it open.
@@ -94,16 +94,19 @@ def make(
             traced: one program for every number of demonstrations.
 
     Raises:
-        ValueError: for a method without networks (`tabular.imitation` fits those), an environment
-            that does not keep to its specification, numbers out of their range, or settings that do
-            not fit each other.
+        ValueError: for a method without networks (`tabular.imitation` fits those), a tabular reward
+            of a task on the host, an environment that does not keep to its specification, numbers
+            out of their range, or settings that do not fit each other.
         TypeError: for an environment of other dtypes.
     """
     if method.tabular and not method.interacts:
         raise ValueError(f"{method.name} does not act: there is nothing to train")
     settings = settings or Settings()
-    env_params = env.default_params if env_params is None else env_params
-    envs.check(env, env_params, steps=0)
+    if isinstance(env, Env):
+        env_params = env.default_params if env_params is None else env_params
+        envs.check(env, env_params, steps=0)
+    elif method.tabular:
+        raise ValueError(f"{method.name} puts the task on a grid, {env.spec.id} is not in JAX")
     algorithm = compose.compose(env.spec, method, settings, capacity)
     beginning = initialise.make(
         env, method, settings, algorithm, env_params=env_params, subset_size=subset_size
@@ -113,9 +116,16 @@ def make(
     )
     update_parts = updates.make_parts(algorithm, method, settings)
     parts = StepParts(algorithm, update_parts, env.spec.max_episode_steps)
-    run = functools.partial(_run, parts, env, env_params, plan)
     if not method.interacts:
-        run = functools.partial(_refuse_to_run, method.name)
+        run = functools.partial(
+            _refuse_to_run, f"{method.name} does not act: its hot start is all of it"
+        )
+    elif isinstance(env, Env):
+        run = functools.partial(_run, parts, env, env_params, plan)
+    else:
+        run = functools.partial(
+            _refuse_to_run, f"{env.spec.id} is stepped on the host: see training.host"
+        )
     return Trainer(
         algorithm=algorithm,
         draw_networks=beginning.draw_networks,
@@ -164,5 +174,5 @@ def _run(
     return jax.lax.scan(advance, state, (keys[:, 0], starts, draws, plans))
 
 
-def _refuse_to_run(name: str, *_: Any, **__: Any) -> Any:
-    raise ValueError(f"{name} does not act: its hot start is all of it")
+def _refuse_to_run(why: str, *_: Any, **__: Any) -> Any:
+    raise ValueError(why)

@@ -122,9 +122,10 @@ def refused(main, tmp_path, capsys):
             "--n-demos: 200 asked, the pool holds 64",
         ),
         (
-            "--env Walker2d-v5",
-            "--env: unknown environment 'Walker2d-v5'; there are: MountainCarContinuous-v0, "
-            "Pendulum-v1, PointMass-v0",
+            "--env Nothing-v0",
+            "--env: unknown environment 'Nothing-v0'; there are: MountainCarContinuous-v0, "
+            "Pendulum-v1, PointMass-v0, and Gymnasium's, which says: "
+            "Environment `Nothing` doesn't exist.",
         ),
         ("--agent.tau 0", "--agent.tau: must be above 0 and at most 1, got 0.0"),
         (

@@ -172,6 +172,7 @@ class _Training:
             slot = np.argsort(slot_seed)[np.minimum(slots.seed, slots.seeds - 1)]
             state = jax.tree.map(lambda leaf: leaf[slot], state)
         state = jax.tree.map(_typed, abstract, jax.device_put(state, programs.sharding))
+        state = programs.resume(state, saved.step)
         record = Record.from_arrays(saved.record, budget)
         training = cls(programs, data, n_demos, record, slots, state)
         training.step = saved.step

@@ -6,13 +6,14 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from gymnasium.vector import VectorEnv
 
 from cmedirl_jax import training
 from cmedirl_jax.agents.hot_start import HotStartData
-from cmedirl_jax.envs import Env
+from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
-from cmedirl_jax.runs.cells import pools
+from cmedirl_jax.runs.cells import host, pools
 from cmedirl_jax.runs.cells.evaluator import Evaluator
 from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.runs.cluster.base import ALONE
@@ -30,10 +31,13 @@ class CompiledMethod(NamedTuple):
         hot_start: `(keys, networks, episodes, groups, data, n_demonstrations) -> networks`; None
             for a method without. `episodes` `[slots, E]` are those of `data` that each seed draws
             its own from. It keeps its latest answer, which the next method asks for again.
-        init: `(keys, networks, episodes, groups, data, n_demonstrations) -> TrainingState`
+        init: `(keys, networks, episodes, first, groups, data, n_demonstrations) -> TrainingState`
             `[slots, ...]`.
+        first: `(keys [slots]) -> first`: what the host knows of the first episodes; None for a task
+            in JAX.
         run: `(state, groups, data, steps, max_episodes) -> (TrainingState, Log)`; the state is
             donated. Only the first `groups` groups of slots on each device are stepped.
+        resume: `(state, step) -> state`: goes on from a checkpoint before step number `step`.
         permute: `(state, move [slots]) -> TrainingState`: slot i takes the seed of slot move[i].
             The state is donated.
         evaluator: noise-free rollouts.
@@ -46,7 +50,9 @@ class CompiledMethod(NamedTuple):
     draw_networks: Callable[[jax.Array, int], Any]
     hot_start: Callable[..., Any] | None
     init: Callable[..., TrainingState]
+    first: Callable[[jax.Array], Any]
     run: Callable[..., tuple[TrainingState, Log]]
+    resume: Callable[[TrainingState, int], TrainingState]
     permute: Callable[[TrainingState, np.ndarray], TrainingState]
     evaluator: Evaluator
     slots: int
@@ -56,7 +62,7 @@ class CompiledMethod(NamedTuple):
 
 
 def compile_networks(
-    env: Env, architecture: Architecture, group: int, devices: Sequence[Any]
+    env: Env | HostEnv, architecture: Architecture, group: int, devices: Sequence[Any]
 ) -> Callable[[jax.Array, int], Any]:
     """Jit the drawing of the networks that every method starts from: `(keys, groups) -> networks`.
 
@@ -72,7 +78,11 @@ def compile_networks(
 
 
 def compile_hot_start(
-    env: Env, settings: Settings, subset_size: int | None, group: int, devices: Sequence[Any]
+    env: Env | HostEnv,
+    settings: Settings,
+    subset_size: int | None,
+    group: int,
+    devices: Sequence[Any],
 ) -> Callable[..., Any]:
     """Jit the hot start, which all methods that have one share; see `CompiledMethod.hot_start`."""
     trainer = training.make(env, METHODS["bc"], settings, capacity=1, subset_size=subset_size)
@@ -122,7 +132,7 @@ class _Latest:
 
 
 def compile_method(
-    env: Env,
+    env: Env | HostEnv,
     method: Method,
     settings: Settings,
     evaluator: Evaluator,
@@ -134,8 +144,12 @@ def compile_method(
     devices: Sequence[Any],
     capacity: int,
     subset_size: int | None,
+    vector: Callable[[int], VectorEnv] | None,
 ) -> CompiledMethod:
-    """Jit a method's training, over seeds in groups and over devices. Compiles at first use."""
+    """Jit a method's training, over seeds in groups and over devices. Compiles at first use.
+
+    `vector` makes the sub-environments of a task on the host.
+    """
     trainer = training.make(env, method, settings, capacity=capacity, subset_size=subset_size)
 
     def spread(function: Callable) -> Callable:
@@ -145,30 +159,39 @@ def compile_method(
         keys: jax.Array,
         networks: Any,
         episodes: DemonstrationSubset | None,
+        first: Any,
         groups: int,
         data: HotStartData | None,
         n_demos: int,
     ) -> TrainingState:
-        def of_seed(seed: tuple[jax.Array, Any, Any], data: HotStartData | None, n_demos: int):
-            key, networks, episodes = seed
+        def of_seed(seed: tuple[jax.Array, Any, Any, Any], data: HotStartData | None, n_demos: int):
+            key, networks, episodes, first = seed
             data = None if data is None else data._replace(episodes=episodes)
-            return seed, trainer.init(key, data, n_demos, networks)
+            return seed, trainer.init(key, data, n_demos, networks, first)
 
-        return spread(of_seed)((keys, networks, episodes), groups, data, n_demos)[1]
+        return spread(of_seed)((keys, networks, episodes, first), groups, data, n_demos)[1]
 
     def permute(state: TrainingState, move: np.ndarray) -> TrainingState:
         return jax.tree.map(lambda leaf: leaf[move], state)
 
     # The same sharding everywhere: JAX compiles again for another one, even if it is equivalent.
     split = seeds.sharding(devices)
+    slots = seeds.padded(seeds_count, group, len(devices))
+    steps = None
+    if vector is not None:
+        steps = host.Steps(trainer, env.spec, functools.partial(vector, slots), devices)
     return CompiledMethod(
         draw_networks=draw_networks,
         hot_start=hot_start,
         init=jax.jit(start, out_shardings=split),
-        run=jax.jit(spread(trainer.run), donate_argnums=0, out_shardings=split),
+        first=steps.first if steps else lambda keys: None,
+        run=steps.run
+        if steps
+        else jax.jit(spread(trainer.run), donate_argnums=0, out_shardings=split),
+        resume=steps.resume if steps else lambda state, step: state,
         permute=jax.jit(permute, donate_argnums=0, out_shardings=split),
         evaluator=evaluator,
-        slots=seeds.padded(seeds_count, group, len(devices)),
+        slots=slots,
         group=group,
         devices=len(devices),
         sharding=split,
@@ -193,17 +216,21 @@ def begin(
     networks = programs.draw_networks(keys, groups)
     if programs.hot_start is not None:
         networks = programs.hot_start(keys, networks, episodes, groups, data, n_demos)
-    return programs.init(keys, networks, episodes, groups, data, n_demos)
+    return programs.init(keys, networks, episodes, programs.first(keys), groups, data, n_demos)
 
 
 def abstract(programs: CompiledMethod, data: HotStartData | None, n_demos: int) -> TrainingState:
     """The shapes and dtypes of what `begin` makes."""
 
+    drawn = seeds.keys(jax.random.key(0), programs.slots)
+    first = programs.first(drawn)
+
     def of_keys(keys: jax.Array) -> TrainingState:
         episodes = None if data is None else pools.episodes_of(data, np.arange(programs.slots))
-        return programs.init(keys, programs.draw_networks(keys, 1), episodes, 1, data, n_demos)
+        networks = programs.draw_networks(keys, 1)
+        return programs.init(keys, networks, episodes, first, 1, data, n_demos)
 
-    return jax.eval_shape(of_keys, seeds.keys(jax.random.key(0), programs.slots))
+    return jax.eval_shape(of_keys, drawn)
 
 
 def pack(
@@ -217,7 +244,7 @@ def pack(
 
 
 def compiler(
-    env: Env,
+    env: Env | HostEnv,
     devices: Sequence[Any],
     *,
     capacity: int,
@@ -242,11 +269,20 @@ def compiler(
         so do a cell's numbers, whatever else is trained beside it.
     """
 
+    on_host = isinstance(env, HostEnv)
+    # Cells follow each other, and share the sub-environments that they train in.
+    vector = functools.cache(env.vector) if on_host else None
+
     def group_of(architecture: Architecture, count: int) -> int:
+        # One step of a task on the host is too short for groups to pay off.
+        if on_host:
+            return -(-count // len(devices))
         return group or seeds.group_size(count, len(devices), architecture.hidden)
 
     @functools.cache
     def evaluator(architecture: Architecture, group: int) -> Evaluator:
+        if isinstance(env, HostEnv):
+            return host.evaluator(env, architecture, gather)
         return evaluator_lib.of_networks(env, architecture, group, devices, gather)
 
     @functools.cache
@@ -269,10 +305,11 @@ def compiler(
             draw_networks(architecture, size),
             hot_start(settings, size) if method.hot_start else None,
             group=size,
-            seeds_count=max(count, least_slots),
+            seeds_count=count if on_host else max(count, least_slots),
             devices=devices,
             capacity=capacity,
             subset_size=subset_size,
+            vector=vector,
         )
 
     return compile_once

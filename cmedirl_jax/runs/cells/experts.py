@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from cmedirl_jax.data.demonstrations import Demonstrations
-from cmedirl_jax.envs import Env
+from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells import recording, scale
 from cmedirl_jax.runs.cells.cell import CellResult, Progress
@@ -25,7 +25,7 @@ EVALUATION_STARTS = 100
 
 def make_pool(
     key: jax.Array,
-    env: Env,
+    env: Env | HostEnv,
     options: Experts,
     programs: CompiledMethod,
     evaluation_starts: int,
@@ -109,7 +109,7 @@ def _chosen(returns: np.ndarray, options: Experts, threshold: float) -> np.ndarr
 
 def _record(
     key: jax.Array,
-    env: Env,
+    env: Env | HostEnv,
     options: Experts,
     programs: CompiledMethod,
     actors: Any,
@@ -125,7 +125,7 @@ def _record(
         return recording.record_all(programs.evaluator.act, env, actors, keys, per_expert, metadata)
 
 
-def _better_than_random(env: Env, best: float) -> float:
+def _better_than_random(env: Env | HostEnv, best: float) -> float:
     """The return that counts as solved; inf if the best expert is no better than random actions."""
     random = scale.random_return(env, EVALUATION_STARTS)
     return scale.solved(random, best) if best > random else np.inf

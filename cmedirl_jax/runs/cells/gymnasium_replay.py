@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.envs import Env
+from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.runs.cells.evaluator import Evaluator
 
 STARTS = 3
@@ -22,12 +22,12 @@ class Replay(NamedTuple):
     jax_return: np.ndarray
 
 
-def replay(evaluator: Evaluator, actors: Any, env: Env) -> Replay | None:
+def replay(evaluator: Evaluator, actors: Any, env: Env | HostEnv) -> Replay | None:
     """Run each seed's policy `[seeds, ...]` from the same starts in both environments.
 
-    None where the task does not say what Gymnasium's state is.
+    None where the task is Gymnasium's own, or does not say what Gymnasium's state is.
     """
-    if env.gymnasium_state is None:
+    if isinstance(env, HostEnv) or env.gymnasium_state is None:
         return None
     jax_return = evaluator.gather(evaluator.on_starts(actors, STARTS).episode_return)
     act = jax.jit(jax.vmap(evaluator.act))

@@ -1,5 +1,6 @@
 """Recording noise-free episodes of policies as a pool of demonstrations."""
 
+import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -9,13 +10,13 @@ import numpy as np
 
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
-from cmedirl_jax.envs import Env
+from cmedirl_jax.envs import Env, HostEnv, stepping
 from cmedirl_jax.types import Transition
 
 
 def record_all(
     act: Callable[[Any, jax.Array], jax.Array],
-    env: Env,
+    env: Env | HostEnv,
     actors: Any,
     keys: Sequence[jax.Array],
     episodes: int,
@@ -31,6 +32,8 @@ def record_all(
         episodes: of each policy.
         metadata: of the pool, which gets the episodes' mean return and its deviation too.
     """
+    if isinstance(env, HostEnv):
+        return joined(record_on_host(act, env, actors, keys, episodes), metadata)
     record_one = jax.jit(lambda actor, key: record(act, env, actor, key, episodes))
     parts = []
     for index, key in enumerate(keys):
@@ -91,6 +94,38 @@ def record(
 
     _, columns, _ = jax.lax.while_loop(more, write, (start, columns, jnp.int32(0)))
     return jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), columns)
+
+
+def record_on_host(
+    act: Callable[[Any, jax.Array], jax.Array],
+    env: HostEnv,
+    actors: Any,
+    keys: Sequence[jax.Array],
+    episodes: int,
+) -> list[Demonstrations]:
+    """The pool of each actor, without metadata; `record_all` describes the arguments."""
+    act_all = jax.jit(jax.vmap(act))
+    seeds = np.stack([jax.random.bits(key, (episodes,), jnp.uint32) for key in keys])
+    with contextlib.closing(env.vector(len(keys))) as vector:
+        played = list(
+            stepping.play(
+                vector, lambda seen: act_all(actors, seen), seeds, env.spec.max_episode_steps
+            )
+        )
+    steps = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *played)
+
+    def pool(actor: int) -> Demonstrations:
+        own = jax.tree.map(lambda leaf: leaf[actor][steps.playing[actor]], steps)
+        transition = Transition(
+            own.observation,
+            own.action,
+            own.answer.reward,
+            own.answer.observation,
+            own.answer.terminated,
+        )
+        return Demonstrations(transition, own.truncated, own.episode.astype(np.int32), {})
+
+    return [pool(actor) for actor in range(len(keys))]
 
 
 def flatten(transition: Transition, running: np.ndarray, truncated: np.ndarray) -> Demonstrations:

@@ -5,6 +5,7 @@ ends are measured on the evaluation starts. The spread of the rewards of single 
 a learned reward has to be to matter beside the task's own.
 """
 
+import contextlib
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.demonstrations import Demonstrations
-from cmedirl_jax.envs import Env, Step
+from cmedirl_jax.envs import Env, HostEnv, Step, stepping
 from cmedirl_jax.runs.cells import recording
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.training import evaluation
@@ -44,7 +45,7 @@ class Scale(NamedTuple):
     reward_spread_demonstrated: float
 
 
-def measure(env: Env, pool: Demonstrations, starts: int) -> Scale:
+def measure(env: Env | HostEnv, pool: Demonstrations, starts: int) -> Scale:
     """The scale of a task by its demonstrations.
 
     Args:
@@ -59,7 +60,11 @@ def measure(env: Env, pool: Demonstrations, starts: int) -> Scale:
     """
     named = np.array(pool.metadata.get("expert_returns", []), float)
     returns = named if np.isfinite(named).any() else demonstrations_lib.returns(pool).mean()
-    expert, random = float(np.nanmax(returns)), random_return(env, starts)
+    expert = float(np.nanmax(returns))
+    if isinstance(env, HostEnv):
+        random, spread = _random_on_host(env, starts)
+    else:
+        random, spread = random_return(env, starts), _random_spread(env)
     threshold = env.spec.reward_threshold
     if threshold is None and not expert > random:
         raise UserError(
@@ -70,7 +75,7 @@ def measure(env: Env, pool: Demonstrations, starts: int) -> Scale:
         random=random,
         expert=expert,
         solved=solved(random, expert) if threshold is None else threshold,
-        reward_spread_random=_random_spread(env),
+        reward_spread_random=spread,
         reward_spread_demonstrated=float(np.std(pool.transition.reward)),
     )
 
@@ -80,8 +85,10 @@ def solved(random: float, expert: float) -> float:
     return random + SOLVED * (expert - random)
 
 
-def random_return(env: Env, starts: int) -> float:
+def random_return(env: Env | HostEnv, starts: int) -> float:
     """The mean return of random actions from the evaluation starts."""
+    if isinstance(env, HostEnv):
+        return _random_on_host(env, starts)[0]
     drawing, params = _drawing(env), env.default_params
 
     @jax.jit
@@ -95,6 +102,25 @@ def random_return(env: Env, starts: int) -> float:
         ).episode_return
 
     return float(np.mean([run(key) for key in jax.random.split(jax.random.key(0), ROUNDS)]))
+
+
+def _random_on_host(env: HostEnv, starts: int) -> tuple[float, float]:
+    """The mean return of random actions, and the standard deviation of a step's reward."""
+    spec, generator = env.spec, np.random.default_rng(0)
+    seeds = np.repeat(np.arange(starts)[:, None], ROUNDS, axis=1)
+
+    def act(observations: np.ndarray) -> np.ndarray:
+        shape = (len(observations), spec.action_dim)
+        return generator.uniform(spec.action_low, spec.action_high, shape)
+
+    with contextlib.closing(env.vector(starts)) as vector:
+        rewards = np.concatenate(
+            [
+                played.answer.reward[played.playing]
+                for played in stepping.play(vector, act, seeds, spec.max_episode_steps)
+            ]
+        )
+    return float(rewards.sum() / seeds.size), float(np.std(rewards))
 
 
 def _random_spread(env: Env) -> float:

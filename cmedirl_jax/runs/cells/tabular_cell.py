@@ -9,7 +9,7 @@ import numpy as np
 
 from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.data import demonstrations
-from cmedirl_jax.envs import Env
+from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.runs.cells import evaluator as evaluator_lib
 from cmedirl_jax.runs.cells import pools
 from cmedirl_jax.runs.cells.cell import CellResult
@@ -60,7 +60,7 @@ class CompiledFit(NamedTuple):
 
 
 def compile_method(
-    env: Env,
+    env: Env | HostEnv,
     method: Method,
     settings: Settings,
     *,
@@ -71,6 +71,7 @@ def compile_method(
     """Jit a method's fit and its evaluators. Compiles at first use."""
     kind = method.tabular
     assert kind is not None
+    assert isinstance(env, Env)
     mdp = jax.jit(lambda: imitation.discretised(env, settings.tabular))()
 
     def of_seed(

@@ -32,7 +32,7 @@ CELLS_ASKED = ("methods", "n_demos", "seeds")
 _LOCK = ".lock"
 NOT_COMPARED = (
     *("out", "grid", "devices", "distributed", "coordinator", "processes", "process_id"),
-    *("checkpoint_every", "check_demos", *CELLS_ASKED),
+    *("checkpoint_every", "check_demos", "asynchronous", *CELLS_ASKED),
 )
 """The options that runs of one configuration may differ in."""
 
@@ -191,7 +191,7 @@ def solved(folder: Path, written: dict[str, Any]) -> float:
     """
     scale, config = written.get("scale"), written["config"]
     try:
-        found = envs.make(config["env"]).spec.reward_threshold if scale is None else scale["solved"]
+        found = envs.find(config["env"]).spec.reward_threshold if scale is None else scale["solved"]
         if found is not None:
             return float(found)
     except (LookupError, TypeError, ValueError) as error:

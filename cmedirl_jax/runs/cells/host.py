@@ -1,0 +1,85 @@
+"""A cell's training and evaluation on a task of the host, in the shape of the compiled ones."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium.vector import VectorEnv
+
+from cmedirl_jax import networks
+from cmedirl_jax.agents.hot_start import HotStartData
+from cmedirl_jax.envs import HostEnv, stepping
+from cmedirl_jax.networks import Architecture
+from cmedirl_jax.runs.cells.evaluator import Evaluator
+from cmedirl_jax.training import Log, Trainer, TrainingState, host, host_loop
+from cmedirl_jax.types import EnvSpec
+
+
+class Steps:
+    """How the seeds of a method are stepped: `first`, `run` and `resume` of a `CompiledMethod`.
+
+    A simulator's state is not in the training state, so that a checkpoint lacks it: training goes
+    on from one at the start of an episode.
+    """
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        spec: EnvSpec,
+        vector: Callable[[], VectorEnv],
+        devices: Sequence[Any],
+    ):
+        """The sub-environments, one a slot, are those that `vector` makes at its first call."""
+        self._vector = vector
+        self._halves = host_loop.compile_halves(trainer, spec.max_episode_steps, devices)
+
+    def first(self, keys: jax.Array) -> tuple[None, np.ndarray]:
+        """Begin the first episodes; the state, which is not here, and observations `[slots, O]`."""
+        return None, stepping.reset(self._vector(), np.asarray(self._halves.first_seeds(keys)))
+
+    def run(
+        self,
+        state: TrainingState,
+        groups: int,
+        data: HotStartData | None,
+        steps: jax.Array,
+        max_episodes: jax.Array | None,
+    ) -> tuple[TrainingState, Log]:
+        """Step every slot: one group is all that a device has."""
+        del groups
+        vector = self._vector()
+        return host_loop.run(self._halves, vector, state, data, np.asarray(steps), max_episodes)
+
+    def resume(self, state: TrainingState, step: int) -> TrainingState:
+        """Begin an episode in every slot."""
+        before, now = np.int32(step - 1), np.int32(step)
+        seeds = np.asarray(self._halves.seeds(state, before))
+        observations = stepping.reset(self._vector(), seeds)
+        return self._halves.begin_episode((state, observations), now)
+
+
+def evaluator(env: HostEnv, architecture: Architecture, gather: Callable[[Any], Any]) -> Evaluator:
+    """An evaluator of actors of one architecture; the fixed starts are reset seeds 0, 1, ..."""
+    act = functools.partial(networks.policy, networks.make(env.spec, architecture))
+    act_all = jax.jit(jax.vmap(act))
+    # As many sub-environments as there are policies.
+    vector = functools.cache(env.vector)
+
+    def play(actors: Any, starts: np.ndarray):
+        # All on one device: a step is too short to share.
+        actors = jax.device_put(gather(actors))
+        count = jax.tree.leaves(actors)[0].shape[0]
+        limit = env.spec.max_episode_steps
+        return host.rollouts(vector(count), lambda seen: act_all(actors, seen), starts, limit)
+
+    def on_starts(actors: Any, count: int, groups: int | None = None):
+        del groups
+        return play(actors, np.arange(count))
+
+    def on_fresh_starts(actors: Any, key: jax.Array, count: int):
+        return play(actors, np.asarray(jax.random.bits(key, (count,), jnp.uint32)))
+
+    return Evaluator(on_starts, on_fresh_starts, act, gather)
