@@ -11,6 +11,7 @@ COMMANDS = (
     "soak",
     "scaling",
     "coverage",
+    "gymnasium_tasks",
     "worker",
 )
 

@@ -82,7 +82,7 @@ def _print(console: Console, summary: pl.DataFrame, folder: Path) -> None:
     screen.show(console, summary_table(summary))
     difference = summary["gymnasium_difference_max"].max()
     if difference is None:
-        console.print("The task says of no state in Gymnasium: no episode was repeated there")
+        console.print("No episode was repeated in Gymnasium: the task is its own, or not there")
     else:
         console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
     if summary["diverged"].sum():

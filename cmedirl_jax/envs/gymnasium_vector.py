@@ -27,6 +27,8 @@ from cmedirl_jax.envs.gymnasium_env import Drawing, Episode
 class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """See `to_gymnasium_vector`."""
 
+    _drawing: Drawing | None = None
+
     def __init__(
         self,
         env: Env,
@@ -126,6 +128,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """A frame of each sub-environment."""
         if self._episodes is None:
             raise gymnasium.error.ResetNeeded("call reset before render")
+        assert self._drawing is not None
         states = jax.device_get(self._episodes.state)
         return tuple(
             self._drawing.draw(
@@ -138,7 +141,8 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def close_extras(self, **kwargs: Any) -> None:
         """Close the window, if there is one."""
         del kwargs
-        self._drawing.close()
+        if self._drawing is not None:
+            self._drawing.close()
 
 
 def _begin_some(

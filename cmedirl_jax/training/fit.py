@@ -10,7 +10,7 @@ from cmedirl_jax.agents import hot_start
 from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.demonstrations import Demonstrations
-from cmedirl_jax.envs import Env
+from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.training import evaluation
 from cmedirl_jax.training import seeds as seeds_lib
 from cmedirl_jax.training.evaluation import Evaluation
@@ -113,10 +113,12 @@ def fit(
         evaluation_starts: start states per evaluation.
 
     Raises:
-        ValueError: for an unknown method, missing demonstrations or some that are not valid for
-            the environment, sizes that are not positive, `steps` that are no multiple of
-            `evaluate_every`, or what `make` refuses.
+        ValueError: for a task on the host, an unknown method, missing demonstrations or some that
+            are not valid for the environment, sizes that are not positive, `steps` that are no
+            multiple of `evaluate_every`, or what `make` refuses.
     """
+    if isinstance(env, HostEnv):
+        raise ValueError(f"{env.spec.id} is stepped on the host: use training.host.fit")
     task = prepare(
         env.spec,
         method,

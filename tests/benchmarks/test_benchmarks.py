@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from benchmarks import (
     checkpoint_cost,
     coverage,
+    gymnasium_tasks,
     main_job,
     measuring,
     naive,
@@ -459,3 +460,27 @@ def test_what_is_used_is_right_at_about_the_promised_rate(tmp_path):
     assert intervals.min() >= 0.8
     assert tests.max() <= 0.2
     assert used.height > 15
+
+
+def test_vectors_and_learners_of_gymnasiums_tasks_are_timed_in_turn(tmp_path, monkeypatch):
+    monkeypatch.setattr(gymnasium_tasks, "CHUNK", 2)
+    monkeypatch.setattr(gymnasium_tasks, "TASKS", gymnasium_tasks.TASKS[:2])
+    out = tmp_path / "rates.json"
+    few = ["--count", "3", "--steps", "2", "--seeds", "2", "--rounds", "2", "--out", str(out)]
+    assert gymnasium_tasks.main(few) == 0
+    written = json.loads(out.read_text())
+    assert [row["what"].rpartition(" ")[2] for row in written["rows"]] == [
+        *gymnasium_tasks.VECTORS,
+        *gymnasium_tasks.VECTORS,
+        *gymnasium_tasks.TASKS,
+    ]
+    for row in written["rows"]:
+        assert len(row["rounds"]) == 2
+        assert min(row["rounds"]) > 0.0
+    for name, gain in written["gains"].items():
+        ours, theirs = (
+            next(row for row in written["rows"] if row["what"] == f"{kind} {name}")["rounds"]
+            for kind in ("to_gymnasium_vector", "SyncVectorEnv")
+        )
+        ratios = sorted(x / y for x, y in zip(ours, theirs, strict=True))
+        assert ratios[0] <= gain <= ratios[-1]

@@ -92,6 +92,19 @@ def test_an_episode_goes_with_its_first_transition():
         assert mask.sum() == (3 if steps <= 7 else 0)
 
 
+def test_an_episode_that_is_cut_off_is_never_sampled():
+    ring = episodes.make(4, 50, 10)
+    state = ring.init()
+    # Two whole episodes of 2 steps with one of 3 between them, which nothing ended.
+    for step, done in enumerate([False, True, False, False, False, False, True]):
+        if step == 5:
+            state = ring.cut(state, jnp.int32(5))
+        state = ring.step(state, jnp.int32(step), jnp.asarray(done))
+    assert state.count == 2
+    assert state.start[:2].tolist() == [0, 5]
+    assert state.length[:2].tolist() == [2, 2]
+
+
 def test_vmapped_rings_do_not_mix():
     ring, together = jitted(3, 7)
     done = np.stack([lasting([1, 2, 3, 4]), lasting([4, 4], 2), lasting([], 10)])

@@ -7,7 +7,6 @@ import scipy.stats
 
 from cmedirl_jax import envs, training
 from cmedirl_jax.training import evaluation, host
-from cmedirl_jax.training.settings import Settings
 from tests.support import host_tasks, pools
 from tests.support.trainers import SMALL
 
@@ -54,6 +53,13 @@ def test_episodes_are_played_from_the_given_starts():
     np.testing.assert_allclose(summary.goal_fraction, [0.0, 1.0])
 
 
+def test_the_other_fit_names_this_one():
+    with pytest.raises(
+        ValueError, match=r"Dock-v0 is stepped on the host: use training\.host\.fit"
+    ):
+        training.fit(jax.random.key(0), DOCK, "ddpg", seeds=1, steps=250)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -74,7 +80,7 @@ def test_what_cannot_be_trained_is_refused(changes, message):
 
 @pytest.mark.statistical
 def test_the_pendulum_learns_alike_in_jax_and_through_the_host():
-    many = {"seeds": 32, "steps": 1_500, "evaluate_every": 1_500, "settings": Settings()}
+    many = {"seeds": 32, "steps": 750, "evaluate_every": 750, "evaluation_starts": 4}
     in_jax = jax.jit(
         lambda key: training.fit(key, envs.make("Pendulum-v1"), "ddpg", **many).evaluations
     )(jax.random.key(0))
@@ -83,7 +89,6 @@ def test_the_pendulum_learns_alike_in_jax_and_through_the_host():
     ).evaluations
     ours, theirs = (np.asarray(each.return_mean)[:, -1] for each in (in_jax, through_host))
     assert scipy.stats.ks_2samp(ours, theirs).pvalue > 0.01
-    # A difference of half a standard deviation would have been seen.
+    # A difference of one standard deviation would have been seen, and training makes one.
     assert scipy.stats.ks_2samp(ours, ours + ours.std()).pvalue < 0.01
-    # It has begun to learn, or there would be nothing to compare.
-    assert np.median(ours) > np.median(in_jax.return_mean[:, 0]) or ours.std() > 50.0
+    assert scipy.stats.ks_2samp(ours, in_jax.return_mean[:, 0]).pvalue < 0.01

@@ -1,0 +1,122 @@
+"""The command on somebody else's task of Gymnasium."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+from cmedirl_jax.runs import load_policy, load_reward
+from cmedirl_jax.runs.cells import cell as cell_lib
+from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.training import tasks
+from experiments import pooled, presets, run_grid
+
+TASK = "tests.support.host_tasks:Dock-v0"
+SMALL = [
+    *("--env", TASK, "--preset", "smoke", "--seeds", "3", "--max-steps", "240"),
+    *("--evaluate-every", "120", "--evaluation-starts", "2", "--experts.steps", "600"),
+    *("--architecture.hidden", "16", "16", "--experts.trajectories", "5", "--devices", "1"),
+]
+METHODS = ["--methods", "ddpg", "hs-me-ddpg"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_fresh_starts():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("cmedirl_jax.runs.train.FRESH_STARTS", 5)
+        patch.setattr("cmedirl_jax.runs.cells.experts.EVALUATION_STARTS", 5)
+        yield
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "dock"
+    assert run_grid.main([*SMALL, *METHODS, "--out", str(folder)]) == 0
+    return folder
+
+
+def test_every_part_of_a_run_is_there(run):
+    for name in ("claims.md", "report.html", "figures/figure3.png", "figures/survival.svg"):
+        assert (run / name).is_file(), name
+    observation = np.zeros(2, np.float32)
+    action = load_policy(run, "hs-me-ddpg", seed=2)(observation)
+    assert -0.5 <= action[0] <= 1.0
+    assert np.isfinite(load_reward(run, "hs-me-ddpg", seed=2)(observation, action))
+    evaluations = pl.read_parquet(run / "evaluations.parquet")
+    assert evaluations["env_step"].unique().sort().to_list() == [0, 120, 240]
+    assert evaluations["length_mean"].max() <= 60.0
+    # Whole episodes of 60 steps, and none besides.
+    episodes = pl.read_parquet(run / "episodes.parquet")
+    assert episodes.filter(~pl.col("terminated"))["length"].unique().to_list() == [60]
+
+
+def test_its_scale_is_measured_on_its_own_starts(run):
+    scale = json.loads((run / "config.json").read_text())["scale"]
+    assert scale["random"] < scale["solved"] < scale["expert"]
+    assert scale["reward_spread_random"] > 0.0
+    assert pooled.load(run).threshold == scale["solved"]
+
+
+def test_a_run_that_was_cut_off_goes_on_at_the_start_of_an_episode(tmp_path, monkeypatch, capsys):
+    """At step 90 of 240, within the second episode of 60 steps."""
+    monkeypatch.setattr(cell_lib, "CHUNK", 90)
+    folder, advance = tmp_path / "run", cell_lib._Training.advance
+
+    def killed(training, stop):
+        if stop > 90 and training.record.budget.max_steps == 240:
+            raise KeyboardInterrupt
+        advance(training, stop)
+
+    command = [*SMALL, "--methods", "ddpg", "--checkpoint-every", "0", "--out", str(folder)]
+    with monkeypatch.context() as patch:
+        patch.setattr(cell_lib._Training, "advance", killed)
+        assert run_grid.main(command) == 130
+    assert run_grid.main(command) == 0
+    assert "goes on" in capsys.readouterr().out
+    episodes = pl.read_parquet(folder / "episodes.parquet").sort("seed", "episode")
+    for _, own in episodes.group_by("seed"):
+        # The episode that was cut off at step 90 is in no table; the next begins there.
+        lengths, ends = own["length"].to_list(), own["env_step"].to_list()
+        assert (lengths[0], ends[0]) == (60, 60)
+        assert ends[1] == 90 + lengths[1]
+        assert max(lengths) <= 60
+    evaluations = pl.read_parquet(folder / "evaluations.parquet")
+    assert evaluations["env_step"].max() == 240
+
+
+def test_processes_of_their_own_change_no_number(run, tmp_path):
+    folder = tmp_path / "run"
+    command = [*SMALL, "--methods", "ddpg", "--out", str(folder), "--asynchronous"]
+    pool = ["--demos", str(run / "demonstrations" / "pool.npz")]
+    assert run_grid.main([*command, *pool]) == 0
+    of_ddpg = pl.col("method") == "ddpg"
+    for name in ("evaluations", "episodes"):
+        expected = pl.read_parquet(run / f"{name}.parquet").filter(of_ddpg)
+        found = pl.read_parquet(folder / f"{name}.parquet")
+        assert_frame_equal(found, expected, rel_tol=1e-3, abs_tol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (["--env", "CartPole-v1"], r"--env: CartPole-v1: its actions are Discrete\(2\)"),
+        (["--env", TASK, "--methods", "maxent-irl"], "maxent-irl: it needs a task in JAX"),
+        (["--env", "Nothing-v0"], "--env: unknown environment 'Nothing-v0'"),
+    ],
+)
+def test_what_the_host_cannot_do_is_refused(options, line, tmp_path, capsys):
+    assert run_grid.main([*options, "--out", str(tmp_path / "x")]) == 2
+    error = capsys.readouterr().err
+    assert re.search(line, error)
+    assert error.count("\n") == 1
+
+
+def test_settings_are_found_by_a_tasks_name_alone(monkeypatch):
+    monkeypatch.setitem(tasks.TASKS, "Dock-v0", tasks.TaskSettings(steps=77))
+    assert presets.preset("tuned", env=TASK).max_steps == 77
+    written = {"config": {"env": TASK}, "scale": {"solved": 3}}
+    assert run_folder.solved(Path("."), written) == 3.0
