@@ -7,6 +7,8 @@ settings they are is part of a run's configuration.
 
 import dataclasses
 
+from cmedirl_jax.agents.ddpg import DDPGHParams
+from cmedirl_jax.agents.exploration import ExplorationSettings, OrnsteinUhlenbeckHParams
 from cmedirl_jax.irl import IRLHParams
 from cmedirl_jax.training.settings import Settings
 
@@ -31,7 +33,14 @@ class TaskSettings:
 # The bounds of r_D are the best of 0.02, 0.1, 0.3, 1 and 3 on 16 seeds (docs/tasks.md).
 _LARGER_REWARD = Settings(reward=IRLHParams(bound=0.3))
 
+# The noise that the car needs would fell the pole at once; returns of 1,000 are scaled to 100.
+_BALANCE = Settings(
+    agent=DDPGHParams(reward_scale=0.1),
+    exploration=ExplorationSettings(ornstein_uhlenbeck=OrnsteinUhlenbeckHParams(sigma=0.1)),
+)
+
 TASKS: dict[str, TaskSettings] = {
+    "InvertedPendulum-v5": TaskSettings(_BALANCE, _BALANCE, steps=10_000, expert_steps=15_000),
     "Pendulum-v1": TaskSettings(_LARGER_REWARD, steps=10_000, expert_steps=10_000),
     "PointMass-v0": TaskSettings(_LARGER_REWARD, steps=10_000, expert_steps=10_000),
 }
