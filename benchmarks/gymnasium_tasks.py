@@ -24,7 +24,7 @@ from rich.table import Table
 
 from benchmarks import measuring
 from cmedirl_jax import envs, training
-from cmedirl_jax.envs import HostEnv, registration, stepping
+from cmedirl_jax.envs import HostEnv
 from cmedirl_jax.ranges import Size
 from cmedirl_jax.runs import start
 from cmedirl_jax.runs.console import ending, screen
@@ -124,7 +124,7 @@ def _gymnasiums(name: str, options: Options) -> Callable[[], int]:
 
 
 def _ours(name: str, options: Options) -> Callable[[], int]:
-    ours = f"{registration.NAMESPACE}/{name}"
+    ours = f"{envs.GYMNASIUM_NAMESPACE}/{name}"
     return _steps_of(gymnasium.make_vec(ours, num_envs=options.count), options)
 
 
@@ -146,13 +146,11 @@ def _learners(name: str, options: Options) -> Callable[[], int]:
     """DDPG's training loop in calls of `CHUNK` steps; learners learn at every step of them."""
     env, keys = envs.find(name), seeds.keys(jax.random.key(0), options.seeds)
     trainer = training.make(env, METHODS["ddpg"], capacity=10_000)
-    begun = {"step": CHUNK}
+    begun: dict[str, Any] = {"step": CHUNK}
     if isinstance(env, HostEnv):
         halves = host_loop.compile_halves(trainer, env.spec.max_episode_steps)
         vector = env.vector(options.seeds)
-        first = stepping.reset(vector, np.asarray(halves.first_seeds(keys)))
-        begin = jax.vmap(lambda key, start: trainer.init(key, None, 0, None, (None, start)))
-        begun["states"] = jax.jit(begin, out_shardings=halves.sharding)(keys, first)
+        begun["states"] = host_loop.begin(halves, trainer, vector, keys)
 
         def run(states: Any, steps: np.ndarray) -> Any:
             return host_loop.run(halves, vector, states, None, steps)

@@ -92,8 +92,9 @@ def of_episode(
             if ended or steps % every == 0:
                 frames.append(env.render())
         env.close()
-    except gymnasium.error.Error as error:
-        raise UserError(f"{task}: Gymnasium cannot draw it ({error})") from error
+    except (gymnasium.error.Error, TypeError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"{task}: Gymnasium cannot draw it ({reason})") from error
     return [np.asarray(frame) for frame in frames]
 
 

@@ -91,9 +91,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     compile_cache.use_cache()
     start.devices()
     try:
-        env = envs.make(options.env)
+        env = envs.find(options.env)
     except ValueError as error:
         raise UserError(f"--env: {error}") from error
+    if not isinstance(env, Env):
+        raise UserError(f"--env: it needs a task in JAX, {options.env} is not")
     pool = validation.load_demonstrations(options.demos, env, "dynamics")
     shared = pools.of_learners(pool, options.seeds)
     table = pl.DataFrame([_row(critic, shared, env, options) for critic in CRITICS])

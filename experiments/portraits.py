@@ -78,7 +78,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     compile_cache.use_cache()
     start.devices()
     try:
-        env = envs.make(config["env"])
+        env = envs.find(config["env"])
+        if not isinstance(env, Env):
+            raise UserError(f"{options.folder}: it needs a task in JAX, {env.spec.id} is not")
         discount = config["settings"]["agent"]["discount"]
         best = value_map(env, discount, options.states, options.actions)
         episodes = of_methods(options.folder, config, env, options.seeds)

@@ -64,12 +64,13 @@ def preset(name: str, grid: str = "main", env: str = CAR) -> StudyConfig:
     """The configuration of a preset, on one of the two grids; `tuned` for an unknown name.
 
     On another task its experts have the settings that work there, see `training.tasks`; under
-    `tuned` its learners too, for as many steps.
+    `tuned` its learners too, for as many steps. On a task without, experts train as learners do.
     """
     config = PRESETS.get(name, PRESETS["tuned"])
     if env != CAR:
-        task = tasks.of(env)
-        experts = dataclasses.replace(config.experts, settings=task.experts)
+        task, known = tasks.of(env), tasks.found(env) is not None
+        own = task.experts if known or config.preset == "paper" else None
+        experts = dataclasses.replace(config.experts, settings=own)
         if config.preset == "tuned":
             experts = dataclasses.replace(experts, steps=task.expert_steps)
             config = dataclasses.replace(config, settings=task.settings, max_steps=task.steps)

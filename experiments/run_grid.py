@@ -3,7 +3,6 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import polars as pl
@@ -12,6 +11,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from cmedirl_jax.envs import Env
 from cmedirl_jax.runs import run as run_lib
 from cmedirl_jax.runs import start, validation
 from cmedirl_jax.runs.cluster import processes
@@ -19,6 +19,8 @@ from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.console import compile_cache, ending, screen, signals, streams
 from cmedirl_jax.runs.errors import Interrupted, UserError
 from cmedirl_jax.runs.storage import plain
+from cmedirl_jax.runs.validation import Plan
+from cmedirl_jax.training import tasks
 from experiments import presets
 
 _STOPPING = "Stopping after this chunk of steps; once more to stop at once\n"
@@ -56,6 +58,9 @@ def work(config: StudyConfig, fewer_will_do: bool) -> int:
         console.quiet = not cluster.writer
         with signals.noted(None if console.quiet else _STOPPING, cluster) as interruption:
             plan = validation.plan(config, cluster, fewer_will_do=fewer_will_do)
+            if config.env != presets.CAR and tasks.found(config.env) is None:
+                said = f"{config.env} has no settings of its own: the car's, see docs/tasks.md"
+                screen.say(console, said)
             if plan.subset_size < max(config.n_demos):
                 held = f"holds {plan.subset_size} demonstrations, and each learner has them all"
                 screen.say(console, f"{config.demos} {held}")
@@ -72,22 +77,22 @@ def work(config: StudyConfig, fewer_will_do: bool) -> int:
     except OSError as error:
         return _end(1, f"{error}; what is finished is kept: {_CONTINUE}")
     if concluded is not None:
-        _print(console, concluded.summary, plan.folder)
+        _print(console, concluded.summary, plan)
         for line in concluded.wrong:
             streams.complain(f"run_grid: {line}; the results stand, and {_CONTINUE}")
     return 0
 
 
-def _print(console: Console, summary: pl.DataFrame, folder: Path) -> None:
+def _print(console: Console, summary: pl.DataFrame, plan: Plan) -> None:
     screen.show(console, summary_table(summary))
     difference = summary["gymnasium_difference_max"].max()
-    if difference is None:
-        console.print("No episode was repeated in Gymnasium: the task is its own, or not there")
-    else:
+    if difference is None and isinstance(plan.env, Env):
+        console.print("No episode was repeated in Gymnasium's own copy of the task: it has none")
+    if difference is not None:
         console.print(f"Largest difference to the same episodes in Gymnasium: {difference:.1g}")
     if summary["diverged"].sum():
         console.print(f"Seeds that diverged and were stopped: {summary['diverged'].sum()}")
-    screen.say(console, f"Tables and figures: {folder}")
+    screen.say(console, f"Tables and figures: {plan.folder}")
 
 
 def _end(exit_code: int, line: str) -> int:

@@ -44,7 +44,8 @@ def test_a_room_imports_only_rooms_above_it(path):
         assert first not in ("experiments", "benchmarks", "tests")
         if first == "cmedirl_jax":
             assert ORDER[rest.split(".")[0]] <= ORDER[room(path)]
-        if first in CLI:
+        # Formats import what reads them when they are read, as the next test shows.
+        if first in CLI and path.parent.name != "formats":
             assert room(path) == "runs"
 
 

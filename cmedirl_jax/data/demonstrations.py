@@ -14,24 +14,34 @@ import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax import checks, ranges
-from cmedirl_jax.data.formats import load, save
+from cmedirl_jax.data.completion import clip, complete
+from cmedirl_jax.data.formats import FORMATS, load, read, save
+from cmedirl_jax.data.formats.minari import from_minari, to_minari
+from cmedirl_jax.data.trajectories import from_trajectories
 from cmedirl_jax.data.validation import check, validate
 from cmedirl_jax.types import Demonstrations, DemonstrationSubset, Numeric, Transition
 
 __all__ = [
+    "FORMATS",
     "DemonstrationSubset",
     "Demonstrations",
     "at",
     "check",
+    "clip",
+    "complete",
     "discounted_returns",
     "episodes",
+    "from_minari",
+    "from_trajectories",
     "load",
+    "read",
     "returns",
     "sample",
     "sample_episodes",
     "sample_index",
     "save",
     "subset",
+    "to_minari",
     "validate",
 ]
 

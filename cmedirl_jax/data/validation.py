@@ -10,6 +10,12 @@ from cmedirl_jax import checks
 from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.types import Demonstrations, EnvSpec, Transition
 
+ABSENT = ("action", "reward")
+"""The fields that a pool may lack. Its metadata then name them under "absent", and all of their
+values are NaN."""
+REPEATED = "repeated_successors"
+"""In a pool's metadata: how many episodes repeat their last observation as its successor, which
+nobody observed."""
 _KINDS = {
     "terminated": ("b", "bool"),
     "truncated": ("b", "bool"),
@@ -22,26 +28,45 @@ def validate(demonstrations: Demonstrations, spec: EnvSpec | None = None) -> Non
 
     Raises:
         ValueError: naming the first mistake: wrong shapes or dtypes, no steps, values that are not
-            finite, episodes out of order. With `spec` also: another environment, observations or
-            actions out of bounds, or a `next_observation` that is not the following step's
-            observation in the same episode.
+            finite in fields that the metadata do not call absent, episodes out of order. With
+            `spec` also: another environment, observations or actions out of bounds, or a
+            `next_observation` that is not the following step's observation in the same episode.
     """
     transition, truncated, episode, metadata = demonstrations
     if spec is not None:
         checks.env_spec(spec)
-    if spec is not None and metadata.get("env") != spec.id:
+    if spec is not None and _name(metadata.get("env")) != _name(spec.id):
         raise ValueError(f"made for environment {metadata.get('env')!r}, not {spec.id!r}")
     arrays = {**transition._asdict(), "truncated": truncated, "episode": episode}
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
-    _validate_arrays(arrays)
+    lacking = absent(demonstrations)
+    _validate_arrays(arrays, lacking)
     _validate_episodes(arrays)
     if spec is not None:
         _validate_sizes(arrays, spec)
-        _validate_bounds(arrays, spec)
+        _validate_bounds({name: x for name, x in arrays.items() if name not in lacking}, spec)
         _validate_continuity(arrays)
 
 
-def _validate_arrays(arrays: dict[str, np.ndarray]) -> None:
+def _name(env: Any) -> Any:
+    """A task's name without the module that registers it."""
+    return env.rpartition(":")[2] if isinstance(env, str) else env
+
+
+def absent(demonstrations: Demonstrations) -> tuple[str, ...]:
+    """The fields that a pool lacks, of `ABSENT`.
+
+    Raises:
+        ValueError: if its metadata name others.
+    """
+    metadata = demonstrations.metadata
+    named = metadata.get("absent", []) if isinstance(metadata, dict) else []
+    if not isinstance(named, list) or any(name not in ABSENT for name in named):
+        raise ValueError(f"absent in its metadata is {named!r}, no list of {' and '.join(ABSENT)}")
+    return tuple(named)
+
+
+def _validate_arrays(arrays: dict[str, np.ndarray], lacking: tuple[str, ...]) -> None:
     size = arrays["reward"].shape
     if len(size) != 1 or size[0] == 0:
         raise ValueError(f"reward must be [N] with N > 0, got shape {size}")
@@ -52,7 +77,10 @@ def _validate_arrays(arrays: dict[str, np.ndarray]) -> None:
         kind, words = _KINDS.get(name, ("f", "floats"))
         if array.dtype.kind != kind:
             raise ValueError(f"{name} has dtype {array.dtype}, expected {words}")
-        if not (np.abs(array) <= np.finfo(np.float32).max).all():
+        if name in lacking:
+            if not np.isnan(array).all():
+                raise ValueError(f"{name} is absent by the metadata, and holds values")
+        elif not (np.abs(array) <= np.finfo(np.float32).max).all():
             raise ValueError(f"{name} holds values that are not finite")
     if arrays["observation"].shape != arrays["next_observation"].shape:
         raise ValueError("observation and next_observation differ in shape")
@@ -74,7 +102,7 @@ def _validate_sizes(arrays: dict[str, np.ndarray], spec: EnvSpec) -> None:
 
 
 def _validate_bounds(arrays: dict[str, np.ndarray], spec: EnvSpec) -> None:
-    for name in ("action", "observation", "next_observation"):
+    for name in {"action", "observation", "next_observation"} & arrays.keys():
         of = name.removeprefix("next_")
         low, high = getattr(spec, f"{of}_low"), getattr(spec, f"{of}_high")
         outside = checks.outside(arrays[name], low, high)
@@ -106,9 +134,10 @@ def check(demonstrations: Demonstrations, env: Env | HostEnv, params: Any = None
     """Check a pool as `validate` does, and each of its steps against the task's own.
 
     Where the task can be set to an observation (`env.state_at`), `env.step` says what follows from
-    each observation and action. Elsewhere this is `validate`. A task that draws random numbers in
-    `step` cannot be checked so: use `validate`. Rounding may decide whether an episode ends, so a
-    step also passes if it is the task's answer to an observation a few roundings away.
+    each observation and action. Elsewhere, and without actions, this is `validate`. Rewards that
+    are absent and successors that nobody observed are not compared. A task that draws random
+    numbers in `step` cannot be checked so: use `validate`. Rounding may decide whether an episode
+    ends, so a step also passes if it is the task's answer to an observation a few roundings away.
 
     Args:
         demonstrations: the pool.
@@ -120,12 +149,17 @@ def check(demonstrations: Demonstrations, env: Env | HostEnv, params: Any = None
             the step, the field, its value, the task's value and the tolerance.
     """
     validate(demonstrations, env.spec)
-    if isinstance(env, HostEnv) or env.state_at is None:
+    lacking = absent(demonstrations)
+    if isinstance(env, HostEnv) or env.state_at is None or "action" in lacking:
         return
     made = jax.tree.map(np.asarray, demonstrations.transition)
     found = np.column_stack([made.next_observation, made.reward, made.terminated])
-    expected = _steps(env, env.default_params if params is None else params, made)
+    expected = steps(env, env.default_params if params is None else params, made)
     tolerance = checks.tolerance(found)
+    # What was not observed is not compared.
+    found = np.where(np.isnan(found), expected[0], found)
+    unseen = unobserved(demonstrations)
+    found[unseen, : env.spec.observation_dim] = expected[0, unseen, : env.spec.observation_dim]
     # NaN agrees with nothing.
     differs = ~(np.abs(found - expected) <= tolerance)
     wrong = np.flatnonzero(differs.any(axis=-1).all(axis=0))
@@ -141,7 +175,7 @@ def check(demonstrations: Demonstrations, env: Env | HostEnv, params: Any = None
         )
 
 
-def _steps(env: Env, params: Any, made: Transition) -> np.ndarray:
+def steps(env: Env, params: Any, made: Transition) -> np.ndarray:
     """What the task answers to each observation, and to two a few roundings away.
 
     Next observation, reward and terminated side by side, `[3, N, O + 2]`.
@@ -160,6 +194,14 @@ def _steps(env: Env, params: Any, made: Transition) -> np.ndarray:
         return jax.vmap(step)(observation + sign * nudge, action)
 
     return np.asarray(jax.lax.map(nudged, np.array([0.0, -1.0, 1.0], np.float32)), np.float64)
+
+
+def unobserved(demonstrations: Demonstrations) -> np.ndarray:
+    """`[N]` bool: the last steps of episodes whose successor nobody observed."""
+    made, episode = demonstrations.transition, np.asarray(demonstrations.episode)
+    repeated = (np.asarray(made.next_observation) == np.asarray(made.observation)).all(axis=-1)
+    last = np.r_[episode[1:] != episode[:-1], True]
+    return last & repeated & bool(demonstrations.metadata.get(REPEATED, 0))
 
 
 def _place(episode: np.ndarray, row: Any) -> str:

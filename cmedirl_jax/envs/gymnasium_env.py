@@ -7,6 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 
@@ -15,9 +16,16 @@ from cmedirl_jax.types import EnvSpec
 
 
 class Episode(NamedTuple):
-    """A running episode: the task's state, and the key of all that is still to be drawn."""
+    """A running episode.
+
+    Attributes:
+        key: of its steps' randomness, and of all later episodes.
+        time: `[]` uint32, steps so far.
+        state: the task's.
+    """
 
     key: jax.Array
+    time: jax.Array
     state: Any
 
 
@@ -25,14 +33,15 @@ def begin(env: Env, params: Any, key: jax.Array) -> tuple[Episode, jax.Array]:
     """Begin an episode; also its first observation `[O]`."""
     reset_key, key = jax.random.split(key)
     state, observation = env.reset(reset_key, params)
-    return Episode(key, state), observation
+    return Episode(key, jnp.zeros((), jnp.uint32), state), observation
 
 
 def advance(env: Env, params: Any, episode: Episode, action: jax.Array) -> tuple[Episode, Step]:
     """Step an episode."""
-    step_key, key = jax.random.split(episode.key)
+    # The numbers 0 and 1 are those of the split that begins the next episode.
+    step_key = jax.random.fold_in(episode.key, episode.time + 2)
     state, answer = env.step(step_key, episode.state, action, params)
-    return Episode(key, state), answer
+    return episode._replace(time=episode.time + 1, state=state), answer
 
 
 def spaces(spec: EnvSpec) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -44,18 +53,25 @@ def spaces(spec: EnvSpec) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
 
 
 class Drawing:
-    """Draws states of a task in Gymnasium's environment of the same name."""
+    """Draws states of a task in Gymnasium's environment of the same name.
+
+    Attributes:
+        metadata: of a task that Gymnasium can draw.
+        modes: the ways to draw this task; none where Gymnasium has no picture of it.
+    """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
 
     def __init__(self, env: Env, render_mode: str | None):
         """Raises ValueError if Gymnasium cannot draw the task so."""
-        self._env = env
-        self._drawn = None
+        self._env, self._drawn = env, None
+        self.modes = [] if env.gymnasium_state is None else self.metadata["render_modes"]
         if render_mode is None:
             return
-        if env.gymnasium_state is None:
-            raise ValueError(f"{env.spec.id}: Gymnasium has no picture of it; leave render_mode")
+        if render_mode not in self.modes:
+            raise ValueError(
+                f"render_mode: {env.spec.id} has no picture {render_mode!r}; there are {self.modes}"
+            )
         self._drawn = gymnasium.make(env.spec.id, render_mode=render_mode)
         self._drawn.reset(seed=0)
 
@@ -79,12 +95,12 @@ class Drawing:
 class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """See `to_gymnasium`."""
 
-    metadata = Drawing.metadata
-
     def __init__(self, env: Env, params: Any = None, render_mode: str | None = None):
         """Its functions are compiled at the first call."""
         params = env.default_params if params is None else params
         spec = env.spec
+        self._drawing = Drawing(env, render_mode)
+        self.metadata = {**Drawing.metadata, "render_modes": self._drawing.modes}
         self.observation_space, self.action_space = spaces(spec)
         self.render_mode = render_mode
         self.spec = GymnasiumSpec(
@@ -96,7 +112,6 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         )
         self._begin = jax.jit(lambda key: begin(env, params, key))
         self._advance = jax.jit(lambda episode, action: advance(env, params, episode, action))
-        self._drawing = Drawing(env, render_mode)
         self._episode: Episode | None = None
         self._action: np.ndarray | None = None
 

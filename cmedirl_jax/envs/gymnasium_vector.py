@@ -39,10 +39,14 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ):
         """Its functions are compiled at the first call."""
         checks.sizes(num_envs=num_envs)
+        if render_mode == "human":
+            raise ValueError("render_mode: a window shows one episode; draw a vector by rgb_array")
+        self._drawing = Drawing(env, render_mode)
         params = env.default_params if params is None else params
         self.num_envs = num_envs
         self.mode = AutoresetMode(autoreset_mode)
-        self.metadata = {**Drawing.metadata, "autoreset_mode": self.mode}
+        modes = [mode for mode in self._drawing.modes if mode != "human"]
+        self.metadata = {**Drawing.metadata, "render_modes": modes, "autoreset_mode": self.mode}
         self.single_observation_space, self.single_action_space = gymnasium_env.spaces(env.spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -50,7 +54,6 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._begin = jax.jit(jax.vmap(functools.partial(gymnasium_env.begin, env, params)))
         self._begin_some = jax.jit(functools.partial(_begin_some, env, params))
         self._step = jax.jit(functools.partial(_STEPS[self.mode], env, params))
-        self._drawing = Drawing(env, render_mode)
         self._episodes: Any = None
         self._observations: Any = None
         self._over = np.zeros(num_envs, bool)
@@ -63,9 +66,9 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin episodes: in all sub-environments, or in those of `options["reset_mask"]`."""
-        mask = (options or {}).get("reset_mask")
-        if mask is None:
-            mask = np.ones(self.num_envs, bool)
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
+        _check_mask(mask, self.num_envs)
         keys = self._keys(seed)
         if self._episodes is None:
             self._episodes, self._observations = self._begin(keys)
@@ -149,8 +152,10 @@ def _begin_some(
     env: Env, params: Any, episodes: Episode, observations: jax.Array, keys: jax.Array, mask: Any
 ) -> tuple[Episode, jax.Array]:
     """Begin those episodes `[n]` that `mask` marks."""
-    begun = jax.vmap(functools.partial(gymnasium_env.begin, env, params))(keys)
-    return _where(mask, begun, (episodes, observations))
+    begin = jax.vmap(functools.partial(gymnasium_env.begin, env, params))
+    running = (episodes, observations)
+    # Most steps end no episode.
+    return jax.lax.cond(jnp.any(mask), lambda: _where(mask, begin(keys), running), lambda: running)
 
 
 def _step(env: Env, params: Any, episodes: Episode, actions: jax.Array, over: Any):
@@ -185,6 +190,14 @@ _STEPS = {
 }
 
 
+def _check_mask(mask: Any, count: int) -> None:
+    """Refuse what Gymnasium's own vectors refuse as a `reset_mask`."""
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (count,):
+        raise ValueError(f"reset_mask: expected a numpy array of {count} bools, got {mask!r}")
+    if not mask.any():
+        raise ValueError("reset_mask: it names no sub-environment")
+
+
 def _where(mask: Any, on_true: Any, on_false: Any) -> Any:
     """`jnp.where` over leaves `[n, ...]`."""
 
@@ -209,7 +222,7 @@ def to_gymnasium_vector(
         num_envs: how many sub-environments.
         params: the task's parameters, default `env.default_params`.
         autoreset_mode: who resets what has ended, and when, as Gymnasium defines it.
-        render_mode: "rgb_array" or "human", where Gymnasium has a picture of the task.
+        render_mode: "rgb_array", where Gymnasium has a picture of the task.
 
     Raises:
         ValueError: for an unknown mode, or if Gymnasium cannot draw the task.

@@ -13,12 +13,12 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from cmedirl_jax.envs import mountain_car, pendulum
-from cmedirl_jax.envs.gymnasium_env import to_gymnasium
+from cmedirl_jax.envs.gymnasium_env import Drawing, to_gymnasium
 from cmedirl_jax.envs.gymnasium_vector import to_gymnasium_vector
 from cmedirl_jax.envs.registry import make
 
-NAMESPACE = "cmedirl_jax"
-"""What stands before a task's name, and a slash."""
+GYMNASIUM_NAMESPACE = "cmedirl_jax"
+"""What stands before the slash and the name of a task of ours in Gymnasium's registry."""
 _NO_LIMIT = 2**31 - 1
 
 
@@ -29,19 +29,24 @@ def make_one(*, task: str, render_mode: str | None = None) -> gymnasium.Env:
     return to_gymnasium(env, params, render_mode=render_mode)
 
 
+# What `gymnasium.make` reads of a class.
+make_one.metadata = Drawing.metadata  # type: ignore[attr-defined]
+
+
 def make_vector(
-    *, task: str, num_envs: int, max_episode_steps: int, **kwargs: Any
+    *, task: str, num_envs: int, max_episode_steps: int | None, **kwargs: Any
 ) -> VectorEnv[np.ndarray, np.ndarray, np.ndarray]:
-    """Make a registered task many times over; see `to_gymnasium_vector`."""
+    """Make a registered task many times over, without a limit for -1; see `to_gymnasium_vector`."""
     env = make(task)
-    params = env.default_params.replace(max_episode_steps=max_episode_steps)
+    limit = _NO_LIMIT if max_episode_steps in (None, -1) else max_episode_steps
+    params = env.default_params.replace(max_episode_steps=limit)
     return to_gymnasium_vector(env, num_envs, params, **kwargs)
 
 
 def register() -> None:
     """Register the tasks of which Gymnasium has its own."""
     for spec in (mountain_car.SPEC, pendulum.SPEC):
-        name = f"{NAMESPACE}/{spec.id}"
+        name = f"{GYMNASIUM_NAMESPACE}/{spec.id}"
         if name not in gymnasium.registry:
             gymnasium.register(
                 name,

@@ -24,8 +24,8 @@ def make(id: str) -> Env:
     """Make an environment by its name.
 
     Raises:
-        ValueError: if there is no such environment; the message lists those there are. If the
-            environment gives itself another name.
+        ValueError: if there is no such environment in JAX; the message lists those there are. If
+            the environment gives itself another name.
     """
     env = ENVS[id]()
     if env.spec.id != id:
@@ -43,18 +43,18 @@ def find(id: str, *, asynchronous: bool = False) -> Env | HostEnv:
         asynchronous: see `from_gymnasium`.
 
     Raises:
-        ValueError: if neither knows the name, something that the task needs is not installed, or as
-            `make` and `from_gymnasium`.
+        ValueError: if neither knows the name, and as `make` and `from_gymnasium`.
     """
     if id in ENVS:
         return make(id)
     try:
         return from_gymnasium(id, asynchronous=asynchronous)
-    except (gymnasium.error.Error, ImportError) as error:
-        ours, reason = ", ".join(ENVS), " ".join(str(error).split())
-        raise ValueError(
-            f"unknown environment {id!r}; there are: {ours}, and Gymnasium's, which says: {reason}"
-        ) from error
+    except ValueError as error:
+        # The names of ours go with Gymnasium's answer.
+        if isinstance(error.__cause__, gymnasium.error.UnregisteredEnv):
+            ours = f"{id!r}; there are: {', '.join(ENVS)}, and Gymnasium's."
+            raise ValueError(f"unknown environment {ours} {error.__cause__}") from error
+        raise
 
 
 def register(id: str, make: Callable[[], Env]) -> None:

@@ -4,8 +4,7 @@ The callers reset sub-environments themselves, each by a seed of its own, so tha
 depends on nothing else. What a vector environment has reset by itself is reset once more.
 """
 
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -38,7 +37,7 @@ def restart(
     if not ended.any():
         return observations
     found = _reset(vector, seeds, {"reset_mask": ended})
-    if not np.array_equal(found[~ended], observations[~ended]):
+    if not np.array_equal(found[~ended], observations[~ended], equal_nan=True):
         raise ValueError(f"{vector}: its reset does not know the option reset_mask")
     return found
 
@@ -75,59 +74,7 @@ def step(vector: VectorEnv, actions: np.ndarray) -> Step:
 def successors(vector: VectorEnv, observations: Any, infos: dict[str, Any]) -> np.ndarray:
     """The true successors `[n, O]` of a step, also where the same step has reset."""
     found = np.array(observations)
-    if vector.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP:
+    if vector.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
         for index in np.flatnonzero(infos.get("_final_obs", ())):
             found[index] = infos["final_obs"][index]
     return found
-
-
-class Played(NamedTuple):
-    """One step of sub-environments that play episodes side by side, leaves `[n, ...]` numpy.
-
-    Attributes:
-        episode: which of its episodes each is in.
-        playing: False for one that has played all of its episodes.
-        observation: before the step.
-        action: taken.
-        answer: the task's.
-        truncated: the episode ended here, and not by the task.
-    """
-
-    episode: np.ndarray
-    playing: np.ndarray
-    observation: np.ndarray
-    action: np.ndarray
-    answer: Step
-    truncated: np.ndarray
-
-
-def play(
-    vector: VectorEnv,
-    act: Callable[[np.ndarray], Any],
-    seeds: np.ndarray,
-    max_episode_steps: int,
-) -> Iterator[Played]:
-    """Play episodes, each sub-environment its own, one after the other, to the last one's end.
-
-    Args:
-        vector: the sub-environments.
-        act: observations `[n, O]` -> actions `[n, A]`.
-        seeds: `[n, E]`, of the starts of each one's episodes.
-        max_episode_steps: steps after which an episode is cut.
-    """
-    count, episodes = seeds.shape
-    every, episode, length = np.arange(count), np.zeros(count, int), np.zeros(count, int)
-    observation = reset(vector, seeds[:, 0])
-    while (episode < episodes).any():
-        action = np.asarray(act(observation))
-        answer = step(vector, action)
-        length += 1
-        truncated = (answer.truncated | (length >= max_episode_steps)) & ~answer.terminated
-        ended = answer.terminated | truncated
-        playing = episode < episodes
-        yield Played(episode, playing, observation, action, answer, truncated)
-        episode = episode + (ended & playing)
-        length[ended] = 0
-        # One that has played all goes on with its last episode: the others need its steps.
-        following = seeds[every, np.minimum(episode, episodes - 1)]
-        observation = restart(vector, following, ended, answer.observation)

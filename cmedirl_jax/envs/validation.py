@@ -30,8 +30,13 @@ def check(env: Env, params: Any = None, *, steps: int | None = None) -> None:
             and what its specification says: observations out of bounds, values that are not finite,
             an episode that goes on after `max_episode_steps`, or another step from
             `state_at(observation)` than from the state that was observed.
-        TypeError: naming what has a wrong dtype.
+        TypeError: naming what has a wrong dtype; for a task on the host.
     """
+    if not isinstance(env, Env):
+        raise TypeError(
+            f"{env.spec.id} is no task in JAX: from_gymnasium has tried it, and "
+            "gymnasium.utils.env_checker.check_env says more"
+        )
     params = env.default_params if params is None else params
     steps = env.spec.max_episode_steps if steps is None else steps
     checks.counts(steps=steps)

@@ -45,8 +45,8 @@ class LearnedReward(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
             discount: of the agent; a potential needs it.
 
         Raises:
-            ValueError: for an unknown mode, a weight that is not finite, or a discount outside
-                [0, 1].
+            ValueError: for actions that are no box, an unknown mode, a weight that is not finite,
+                or a discount outside [0, 1].
         """
         gymnasium.utils.RecordConstructorArgs.__init__(
             self, reward=reward, mode=mode, weight=weight, discount=discount
@@ -57,16 +57,18 @@ class LearnedReward(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Reset the environment."""
-        self._observation, info = self.env.reset(**kwargs)
-        return self._observation, info
+        observation, info = self.env.reset(**kwargs)
+        self._observation = np.array(observation)
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment."""
-        before = self._observation
-        self._observation, reward, terminated, truncated, info = self.env.step(action)
-        paid = self._pay(before, action, reward, self._observation, terminated)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        paid = self._pay(self._observation, action, reward, observation, terminated)
+        # A copy: the environment may write over the array that it gave.
+        self._observation = np.array(observation)
         info = {**info, "environment_reward": reward}
-        return self._observation, float(paid), terminated, truncated, info
+        return observation, float(paid), terminated, truncated, info
 
 
 class LearnedRewardVector(VectorWrapper):
@@ -88,20 +90,25 @@ class LearnedRewardVector(VectorWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
         """Reset the sub-environments, or those of `options["reset_mask"]`."""
-        self._over = self._over & False
-        self._observations, infos = self.env.reset(seed=seed, options=options)
-        return self._observations, infos
+        # Gymnasium's vectors take the mask out of the options.
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._over = self._over & ~mask
+        self._observations = np.array(observations)
+        return observations, infos
 
     def step(self, actions: Any) -> Any:
         """Step the sub-environments; a step that only resets one pays nothing."""
-        before, resets = self._observations, self._over
-        self._observations, rewards, terminated, truncated, infos = self.env.step(actions)
-        successors = stepping.successors(self.env, self._observations, infos)
-        paid = np.asarray(self._pay(before, actions, rewards, successors, terminated))
-        if self.env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
+        resets = self._over
+        observations, rewards, terminated, truncated, infos = self.env.step(actions)
+        successors = stepping.successors(self.env, observations, infos)
+        paid = self._pay(self._observations, actions, rewards, successors, terminated)
+        if self.env.metadata.get("autoreset_mode") is AutoresetMode.NEXT_STEP:
             self._over = terminated | truncated
-        infos = {**infos, "environment_reward": rewards}
-        return self._observations, np.where(resets, rewards, paid), terminated, truncated, infos
+        self._observations = np.array(observations)
+        every = np.ones(self.num_envs, bool)
+        infos = {**infos, "environment_reward": rewards, "_environment_reward": every}
+        return observations, np.where(resets, rewards, paid), terminated, truncated, infos
 
 
 class _Payment:
@@ -110,6 +117,8 @@ class _Payment:
     def __init__(self, reward: Reward, actions: Any, mode: Mode, weight: float, discount: float):
         if mode not in ("replace", "add", "potential"):
             raise ValueError(f"mode: {mode!r} is none of replace, add, potential")
+        if not isinstance(actions, gymnasium.spaces.Box):
+            raise ValueError(f"its actions are {actions}, not a Box")
         checks.within(FINITE, weight=weight)
         checks.shares(discount=discount)
         self._reward, self._actions = reward, actions

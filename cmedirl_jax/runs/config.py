@@ -26,13 +26,14 @@ class ExpertSettings:
         steps: Environment steps of each expert.
         trajectories: Trajectories that a learner draws its demonstrations from, at least. Default:
             200 of its own expert, or 1,024 that all share; more if n-demos asks for more.
-        settings: What they train with; the task's, see `training.tasks`.
+        settings: What they train with: the task's, see `training.tasks`; None: what the learners
+            train with.
     """
 
     seeds: Size | None = None
     steps: Size = 14_000
     trajectories: Size | None = None
-    settings: tyro.conf.Suppress[Settings] = Settings()
+    settings: tyro.conf.Suppress[Settings | None] = Settings()
 
 
 class Experts(NamedTuple):
@@ -88,7 +89,7 @@ class StudyConfig:
         env: The task, by its name: one of this library's, or else Gymnasium's, MODULE:NAME too;
             under tuned it brings settings of its own, where it has some.
         asynchronous: Step each learner's copy of a task of Gymnasium's in a process of its own,
-            for tasks whose steps take longer than some 0.1 ms.
+            for slow tasks.
         devices: CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU.
             With several processes, of each of them.
         group: Seeds that a device steps together; default: what is fastest for the networks' width.
@@ -139,7 +140,7 @@ class StudyConfig:
             self.experts.seeds or (self.seeds if each else 16),
             self.experts.steps,
             self.experts.trajectories or max(200 if each else 1_024, *self.n_demos),
-            self.experts.settings,
+            self.experts.settings or self.settings,
         )
 
     @property

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.data.hot_start_data import HotStartData
+from cmedirl_jax.envs import Env
 from cmedirl_jax.runs import numerics
 from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells import compiled as compiled_lib
@@ -154,10 +155,12 @@ def train_cells(session: Session, todo: Sequence[Cell]) -> None:
     # Experts if they are needed, then the cells.
     with reporter(session.console, len(todo) + trains_experts, steps) as report:
         if trains_experts:
-            report.start(f"experts, {plan.experts.seeds} seeds")
+            only = "" if any(cell.n_demos for cell in todo) else ", to tell what counts as solved"
+            report.start(f"experts, {plan.experts.seeds} seeds{only}")
             with session.checkpointer(EXPERTS) as checkpointer:
                 pool = _train_experts(session, checkpointer, report)
             used = plan.of_learners(pool)
+            screen.say(session.console, _who_demonstrates(pool, plan.seeds))
         if used is not None:
             used = used._replace(data=session.place(used.data))
         if pool is not None and stored is None and cluster.writer:
@@ -172,6 +175,13 @@ def train_cells(session: Session, todo: Sequence[Cell]) -> None:
             report.start(cell.title)
             with session.checkpointer(cell.name) as checkpointer:
                 _train_cell(session, checkpointer, cell, used, solved, report)
+
+
+def _who_demonstrates(pool: Demonstrations, learners: int) -> str:
+    known = pool.metadata
+    solved, trained = known["experts_solved"], known["experts_trained"]
+    chosen = f"{len(known['experts_demonstrating'])} demonstrate for {learners} learners"
+    return f"{solved} of {trained} experts solve the task; {chosen}"
 
 
 def _note_scale(session: Session, pool: Demonstrations) -> float:
@@ -201,11 +211,13 @@ def _train_experts(
     session: Session, checkpointer: Checkpointer, report: Reporter
 ) -> Demonstrations:
     plan = session.plan
+    # In JAX experts are stepped in groups as learners are, and share what is compiled.
+    count = plan.seeds if isinstance(plan.env, Env) else plan.experts.seeds
     return experts.make_pool(
         session.keys.experts,
         plan.env,
         plan.experts,
-        session.compiled(METHODS["ddpg"], plan.experts.settings, plan.seeds),
+        session.compiled(METHODS["ddpg"], plan.experts.settings, count),
         plan.budget.evaluation_starts,
         _stepwise(report, plan.experts.seeds),
         checkpointer,

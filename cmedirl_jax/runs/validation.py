@@ -98,8 +98,6 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool =
     """
     check(config)
     env = envs.find(config.env, asynchronous=config.asynchronous)
-    if isinstance(env, HostEnv) and config.cluster.several:
-        raise UserError(f"--env: {config.env} is stepped on one host; leave --processes")
     path, demos = config.demos, None
     if path is not None:
         demos = cluster.pool_from_writer(lambda: load_demonstrations(path, env, config.check_demos))
@@ -165,7 +163,8 @@ def check(config: StudyConfig) -> None:
         if isinstance(env, Env):
             envs.check(env, steps=0)
     except (TypeError, ValueError) as error:
-        raise UserError(f"--env: {error}") from error
+        raise UserError(f"--env: {' '.join(str(error).split())}") from error
+    _check_host(config, isinstance(env, HostEnv))
     for name in ("methods", "n_demos"):
         values = getattr(config, name)
         if not values or len(set(values)) < len(values):
@@ -185,6 +184,16 @@ def check(config: StudyConfig) -> None:
     if config.demos is None:
         asked = cells.asked(config.methods, config.n_demos)
         _check_enough(asked, config.resolved_experts.trajectories)
+
+
+def _check_host(config: StudyConfig, on_host: bool) -> None:
+    """Refuse options that say nothing to the task's kind."""
+    if on_host and config.cluster.several:
+        raise UserError(f"--processes: {config.env} is stepped on one host, by one process")
+    if on_host and config.group is not None:
+        raise UserError(f"--group: {config.env} is stepped on the host, all seeds together")
+    if config.asynchronous and not on_host:
+        raise UserError(f"--asynchronous: {config.env} is a task in JAX")
 
 
 def _check_parts(config: StudyConfig, env: Env | HostEnv, capacity: int) -> None:

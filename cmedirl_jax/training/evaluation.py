@@ -5,9 +5,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from gymnasium.vector import VectorEnv
 
 from cmedirl_jax import checks, modes
-from cmedirl_jax.envs import Env
+from cmedirl_jax.envs import Env, playing
 
 
 class Rollouts(NamedTuple):
@@ -93,6 +95,27 @@ def rollout(
     result = Rollouts(jnp.zeros(count, jnp.float32), jnp.zeros(count, jnp.int32), nothing)
     carry = (states, observations, nothing, result, jnp.zeros((), jnp.int32))
     return jax.lax.while_loop(running, advance, modes.settle(advance, carry))[3]
+
+
+def rollout_on_host(
+    policy: Callable[[np.ndarray], Any], vector: VectorEnv, starts: np.ndarray, limit: int
+) -> Rollouts:
+    """Play episodes of `n` policies, one a sub-environment; `[n, E]` numpy.
+
+    Args:
+        policy: observations `[n, O]` -> actions `[n, A]`.
+        vector: `n` sub-environments.
+        starts: `[E]`, the reset seeds of each policy's episodes.
+        limit: steps after which an episode is cut.
+    """
+    shape = (vector.num_envs, len(starts))
+    result = Rollouts(np.zeros(shape, np.float32), np.zeros(shape, np.int32), np.zeros(shape, bool))
+    for played in playing.play(vector, policy, np.broadcast_to(starts, shape), limit):
+        at = np.flatnonzero(played.playing), played.episode[played.playing]
+        result.episode_return[at] += played.answer.reward[played.playing]
+        result.length[at] += 1
+        result.terminated[at] = played.answer.terminated[played.playing]
+    return result
 
 
 def summarise(rollouts: Rollouts) -> Evaluation:

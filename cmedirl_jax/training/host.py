@@ -1,4 +1,4 @@
-"""Training many seeds on a task of the host, and evaluating policies there.
+"""Training many seeds on a task of the host, and evaluating them as they go.
 
     task = envs.from_gymnasium("InvertedPendulum-v5")
     result = training.host.fit(key, task, "hs-me-ddpg", demonstrations, seeds=8, steps=10_000)
@@ -7,44 +7,20 @@ What it runs in JAX it compiles itself: a task on the host cannot be within the 
 """
 
 import contextlib
-from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
-from gymnasium.vector import VectorEnv
 
 from cmedirl_jax.data.demonstrations import Demonstrations
-from cmedirl_jax.envs import HostEnv, stepping
+from cmedirl_jax.envs import HostEnv
 from cmedirl_jax.training import evaluation, host_loop
 from cmedirl_jax.training import seeds as seeds_lib
-from cmedirl_jax.training.evaluation import Evaluation, Rollouts
+from cmedirl_jax.training.evaluation import Evaluation
 from cmedirl_jax.training.fit import Result, prepare
 from cmedirl_jax.training.initialise import TrainingState
 from cmedirl_jax.training.methods import Method
 from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.training.trainer import make
-
-
-def rollouts(
-    vector: VectorEnv, act: Callable[[np.ndarray], Any], starts: np.ndarray, limit: int
-) -> Rollouts:
-    """Play episodes of `n` policies, one a sub-environment; `[n, E]` numpy.
-
-    Args:
-        vector: `n` sub-environments.
-        act: observations `[n, O]` -> actions `[n, A]`.
-        starts: `[E]`, the reset seeds of each policy's episodes.
-        limit: steps after which an episode is cut.
-    """
-    shape = (vector.num_envs, len(starts))
-    result = Rollouts(np.zeros(shape, np.float32), np.zeros(shape, np.int32), np.zeros(shape, bool))
-    for played in stepping.play(vector, act, np.broadcast_to(starts, shape), limit):
-        at = np.flatnonzero(played.playing), played.episode[played.playing]
-        result.episode_return[at] += played.answer.reward[played.playing]
-        result.length[at] += 1
-        result.terminated[at] = played.answer.terminated[played.playing]
-    return result
 
 
 def fit(
@@ -104,27 +80,13 @@ def fit(
         def evaluate(states: TrainingState) -> Evaluation:
             actor = states.agent.actor
             return summarise(
-                rollouts(
-                    evaluating,
-                    lambda observations: act(actor, observations),
-                    starts,
-                    env.spec.max_episode_steps,
+                evaluation.rollout_on_host(
+                    lambda seen: act(actor, seen), evaluating, starts, env.spec.max_episode_steps
                 )
             )
 
-        # Begin.
         keys = seeds_lib.keys(key, seeds)
-        first = stepping.reset(vector, np.asarray(halves.first_seeds(keys)))
-        begin = jax.jit(
-            jax.vmap(
-                lambda key, start: trainer.init(
-                    key, task.data, task.n_demonstrations, None, (None, start)
-                )
-            ),
-            out_shardings=halves.sharding,
-        )
-        states = begin(keys, first)
-        # Train and evaluate.
+        states = host_loop.begin(halves, trainer, vector, keys, task.data, task.n_demonstrations)
         evaluations, logs = [evaluate(states)], []
         for chunk in np.arange(steps, dtype=np.int32).reshape(-1, evaluate_every):
             states, log = host_loop.run(halves, vector, states, task.data, chunk)

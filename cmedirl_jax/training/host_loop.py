@@ -3,7 +3,7 @@
 One compiled call a step does all that follows from the task's answers and chooses the next actions,
 for all seeds. Between two calls numpy steps the task, one sub-environment a seed. Each episode's
 start is seeded by the learner's key and the step before it, so that a seed's numbers depend neither
-on the others nor on where a run was interrupted between two episodes.
+on the others nor on whether it was interrupted between two episodes.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,8 +36,8 @@ class Halves(NamedTuple):
             behaves at the next one. The states are donated.
         first_seeds: `(keys [S]) -> [S] uint32`, of the starts of the learners' first episodes.
         seeds: `(states, step) -> [S] uint32`, of the episodes that begin after step number `step`.
-        begin_episode: `((states, observation [S, O]), step) -> TrainingState`: what runs is cut off
-            before step number `step`, where an episode begins with that observation.
+        begin_episode: `((states, observation [S, O]), step) -> TrainingState`: with step number
+            `step` an episode begins with that observation; the running one is cut off.
         max_episode_steps: steps after which an episode is cut.
     """
 
@@ -118,7 +118,9 @@ def _begin_episode(
     if sampler is not None and trainer.algorithm.sampler is not None:
         sampler = trainer.algorithm.sampler.cut(sampler, step)
     if running is not None:
-        running = observation_statistics.add(running, observation)
+        # An episode that had just begun was begun with this observation.
+        added = observation_statistics.add(running, observation)
+        running = step_lib.select(state.episode_length == 0, running, added)
     return state.replace(
         exploration=trainer.algorithm.exploration.reset(state.exploration),
         sampler=sampler,
@@ -127,6 +129,32 @@ def _begin_episode(
         episode_length=jnp.zeros_like(state.episode_length),
         observation_statistics=running,
     )
+
+
+def begin(
+    halves: Halves,
+    trainer: Trainer,
+    vector: VectorEnv,
+    keys: jax.Array,
+    data: HotStartData | None = None,
+    n_demonstrations: int = 0,
+) -> TrainingState:
+    """The seeds before their first step, `[S, ...]`, and the sub-environments with them.
+
+    Args:
+        halves: of the trainer.
+        trainer: the trainer.
+        vector: `S` sub-environments.
+        keys: `[S]`, the learners'.
+        data: the demonstrations, for methods that use them.
+        n_demonstrations: episodes that each learner draws of them.
+    """
+    first = stepping.reset(vector, np.asarray(halves.first_seeds(keys)))
+
+    def of_seed(key: jax.Array, start: jax.Array) -> TrainingState:
+        return trainer.init(key, data, n_demonstrations, None, (None, start))
+
+    return jax.jit(jax.vmap(of_seed), out_shardings=halves.sharding)(keys, first)
 
 
 def run(

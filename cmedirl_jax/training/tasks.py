@@ -5,7 +5,9 @@ find better ones is in docs/tasks.md. Add your own by `TASKS[name] = TaskSetting
 settings they are is part of a run's configuration.
 """
 
+import contextlib
 import dataclasses
+import importlib
 
 from cmedirl_jax.agents.ddpg import DDPGHParams
 from cmedirl_jax.agents.exploration import ExplorationSettings, OrnsteinUhlenbeckHParams
@@ -48,5 +50,14 @@ TASKS: dict[str, TaskSettings] = {
 
 
 def of(task: str) -> TaskSettings:
-    """What works on a task, by its name; `module:` before it does not matter."""
-    return TASKS.get(task.rpartition(":")[2], TaskSettings())
+    """What works on a task, by its name, with or without the `module:` that registers it."""
+    return found(task) or TaskSettings()
+
+
+def found(task: str) -> TaskSettings | None:
+    """The same; None for a task without. Imports its module, which may add them."""
+    module, _, name = task.rpartition(":")
+    if module:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(module)
+    return TASKS.get(task) or TASKS.get(name)

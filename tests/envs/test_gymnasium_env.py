@@ -26,9 +26,11 @@ def test_gymnasiums_checker_finds_nothing(name):
 
 
 def test_gymnasiums_checker_finds_nothing_in_a_task_without_a_picture():
-    check_env(envs.to_gymnasium(envs.make("PointMass-v0")), skip_render_check=True)
-    with pytest.raises(ValueError, match="PointMass-v0: Gymnasium has no picture of it"):
+    check_env(envs.to_gymnasium(envs.make("PointMass-v0")))
+    with pytest.raises(ValueError, match=r"PointMass-v0 has no picture 'rgb_array'.*\[\]"):
         envs.to_gymnasium(envs.make("PointMass-v0"), render_mode="rgb_array")
+    with pytest.raises(ValueError, match="Pendulum-v1 has no picture 'ansi'"):
+        envs.to_gymnasium(envs.make("Pendulum-v1"), render_mode="ansi")
 
 
 def test_gymnasium_finds_them_where_nothing_was_imported():
@@ -102,7 +104,11 @@ def test_a_frame_shows_the_state_and_the_torque(monkeypatch):
     window.reset(seed=0)
     window.step(np.zeros(1, np.float32))
     assert window.render() is None
-    for each in (env, theirs, window):
+    films = gymnasium.make("cmedirl_jax/Pendulum-v1", render_mode="rgb_array_list")
+    films.reset(seed=0)
+    films.step(action)
+    assert len(films.render()) == 2
+    for each in (env, theirs, window, films):
         each.close()
 
 

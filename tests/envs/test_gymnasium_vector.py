@@ -85,6 +85,13 @@ def test_what_has_ended_is_not_stepped_where_nobody_resets_it():
         vector.step(np.zeros((2, 1)))
     with pytest.raises(ValueError, match="seed: 3 seeds for 2 sub-environments"):
         vector.reset(seed=[1, 2, 3])
+    for mask in ([True, False], np.array([1, 0]), np.array([True])):
+        with pytest.raises(ValueError, match="reset_mask: expected a numpy array of 2 bools"):
+            vector.reset(options={"reset_mask": mask})
+    with pytest.raises(ValueError, match="reset_mask: it names no sub-environment"):
+        vector.reset(options={"reset_mask": np.zeros(2, bool)})
+    with pytest.raises(ValueError, match="a window shows one episode"):
+        envs.to_gymnasium_vector(task, 2, render_mode="human")
     with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
         envs.to_gymnasium_vector(task, 0)
     with pytest.raises(ValueError, match="'Sometimes' is not a valid AutoresetMode"):
@@ -102,6 +109,16 @@ def test_a_seed_decides_all_episodes_and_no_seed_is_another():
     assert (runs[0] != runs[1]).any()
     fresh, _ = both("NextStep")
     assert (fresh.reset()[0] != runs[0][0]).any()
+
+
+def test_without_a_time_limit_it_goes_on():
+    for limit in (-1, None):
+        kwargs = {} if limit is None else {"max_episode_steps": limit}
+        vector = gymnasium.make_vec("cmedirl_jax/Pendulum-v1", num_envs=1, **kwargs)
+        vector.reset(seed=3)
+        assert vector.np_random_seed == 3
+        flags = [vector.step(np.zeros((1, 1), np.float32))[3][0] for _ in range(250)]
+        assert flags.index(True) == 199 if limit is None else not any(flags)
 
 
 @pytest.mark.parametrize("mode", MODES[:2])

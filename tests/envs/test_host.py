@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from cmedirl_jax import envs
-from cmedirl_jax.envs import pendulum
+from cmedirl_jax.envs import pendulum, playing
 from tests.support.host_tasks import Counting, Dock
 
 BOX = gymnasium.spaces.Box
@@ -54,6 +54,7 @@ def test_arguments_and_wrappers_reach_every_sub_environment():
         (BOX(-1, 1, (2,)), BOX(-1, 1, (2, 2)), r"actions are of shape \(2, 2\), not a Box"),
         (BOX(-1, 1, (2,)), BOX(-np.inf, 1, (1,)), "no bounds; give wrappers that bound them"),
         (BOX(-1, 1, (2,)), gymnasium.spaces.MultiBinary(2), "its actions are MultiBinary"),
+        (BOX(-1, 1, (2,)), BOX(-3, 3, (1,), np.int32), "its actions are int32; DDPG's are"),
     ],
     ids=str,
 )
@@ -80,6 +81,54 @@ def test_a_dictionary_is_flattened_by_the_wrapper_that_the_message_names():
     assert task.vector(1).reset(seed=0)[0].shape == (1, 2)
 
 
+class Odd(Dock):
+    """Gives `observation` and `reward`, and infos that no vector can stack."""
+
+    def __init__(self, observation=(0.0, 0.0), reward=0.0):
+        self.observation, self.reward, self.episodes = np.asarray(observation), reward, 0
+
+    def reset(self, *, seed=None, options=None):
+        gymnasium.Env.reset(self, seed=seed)
+        assert options is None
+        self.episodes += 1
+        return self.observation, {"episodes": [None] * self.episodes}
+
+    def step(self, action):
+        return self.observation, self.reward, False, False, {"seed": self.np_random_seed or None}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"observation": [[0.0, 0.0]]}, "an observation of reset is .*not finite numbers of shape"),
+        ({"observation": [0.0, np.nan]}, "an observation of reset is .*nan"),
+        ({"reward": np.zeros(1)}, r"a reward is array\(\[0.\]\), not finite numbers of shape \(\)"),
+        ({"reward": None}, "a reward is None"),
+        ({"colour": "red"}, r"Odd cannot be made \(TypeError: .*colour"),
+    ],
+    ids=str,
+)
+def test_a_task_that_does_not_give_what_it_says_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        envs.from_gymnasium(Odd, max_episode_steps=3, **given)
+
+
+def test_infos_and_options_are_nobodys_concern():
+    task = envs.from_gymnasium(Odd, max_episode_steps=2, reward=np.int64(3))
+    played = list(playing.play(task.vector(3), lambda seen: seen[:, :1], np.ones((3, 2), int), 2))
+    assert [step.answer.reward.tolist() for step in played] == [[3.0] * 3] * 4
+
+
+def test_a_time_limit_is_never_beyond_the_tasks_own():
+    assert envs.from_gymnasium("Pendulum-v1", max_episode_steps=500).spec.max_episode_steps == 500
+    vector = envs.from_gymnasium("Pendulum-v1", max_episode_steps=300).vector(1)
+    vector.reset(seed=0)
+    flags = [vector.step(np.zeros((1, 1), np.float32))[3][0] for _ in range(300)]
+    assert flags == [False] * 299 + [True]
+    with pytest.raises(ValueError, match="it ends after 60 steps, before max_episode_steps"):
+        envs.from_gymnasium(lambda: gymnasium.make("Dock-v0"), max_episode_steps=61)
+
+
 def test_a_task_without_a_time_limit_is_refused():
     with pytest.raises(ValueError, match="Counting: it has no time limit; give max_episode_steps"):
         envs.from_gymnasium(Counting)
@@ -91,7 +140,7 @@ def test_names_are_ours_first_and_gymnasiums_otherwise():
     assert envs.find("tests.support.host_tasks:Dock-v0").spec.max_episode_steps == 60
     with pytest.raises(ValueError, match=r"unknown environment 'No-v0'; there are: .*Pendulum-v1"):
         envs.find("No-v0")
-    with pytest.raises(ValueError, match="No module named 'nothing'"):
+    with pytest.raises(ValueError, match=r"nothing:No-v0 cannot be made \(ModuleNotFoundError: No"):
         envs.find("nothing:No-v0")
 
 

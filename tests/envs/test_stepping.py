@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cmedirl_jax import envs
-from cmedirl_jax.envs import stepping
+from cmedirl_jax.envs import playing, stepping
 from tests.support.host_tasks import Counting
 
 MODES = list(AutoresetMode)
@@ -20,7 +20,7 @@ def vector_of(count, mode=AutoresetMode.DISABLED, **kwargs):
 def episodes_of(vector, seeds, actions=lambda seen: np.zeros((len(seen), 1)), limit=99):
     """What `play` gave of each sub-environment's episodes: observations and last flags."""
     played = [[[] for _ in row] for row in seeds]
-    for step in stepping.play(vector, actions, np.asarray(seeds), limit):
+    for step in playing.play(vector, actions, np.asarray(seeds), limit):
         for index in np.flatnonzero(step.playing):
             played[index][step.episode[index]].append(
                 (
@@ -71,6 +71,20 @@ def test_what_knows_no_mask_is_refused():
         stepping.restart(vector, np.array([5, 6]), np.array([True, False]), before)
 
 
+def test_observations_that_are_no_numbers_are_no_fault_of_the_others():
+    before = np.array([[np.nan, 1.0], [2.0, 2.0]], np.float32)
+
+    class Nan(SyncVectorEnv):
+        def reset(self, *, seed=None, options=None):
+            found, infos = super().reset(seed=seed, options=options)
+            return np.concatenate([before[:1], found[1:]]), infos
+
+    vector = Nan([Counting] * 2)
+    stepping.reset(vector, np.array([0, 2]))
+    found = stepping.restart(vector, np.array([5, 6]), np.array([False, True]), before)
+    np.testing.assert_array_equal(found, [[np.nan, 1.0], [6.0, 0.0]])
+
+
 def test_actions_are_finite_and_within_the_bounds():
     vector = vector_of(3)
     stepping.reset(vector, np.array([2, 2, 2]))
@@ -86,8 +100,9 @@ def test_processes_of_their_own_give_the_same():
         for way in (False, True)
     ]
     results = []
-    for task in ways:
+    for task, kind in zip(ways, (SyncVectorEnv, AsyncVectorEnv), strict=True):
         vector = task.vector(2)
+        assert type(vector) is kind
         results.append(episodes_of(vector, starts, lambda seen: seen[:, :1], 5))
         vector.close()
     assert results[0] == results[1]

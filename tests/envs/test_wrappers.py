@@ -69,6 +69,25 @@ def test_a_vector_pays_each_what_a_single_one_pays(mode, autoreset):
             observed, _ = vector.reset(seed=seeds, options={"reset_mask": ended})
 
 
+def test_arrays_that_the_environment_writes_over_are_copied():
+    vector = LearnedRewardVector(SyncVectorEnv([Counting] * 2, copy=False), learned)
+    vector.reset(seed=[4, 5])
+    _, found, *_ = vector.step(np.zeros((2, 1)))
+    np.testing.assert_allclose(found, [4.0, 5.0])
+
+
+def test_a_partial_reset_leaves_the_others_to_reset_themselves():
+    vector = LearnedRewardVector(SyncVectorEnv([Counting] * 2), learned)
+    vector.reset(seed=[3, 3])
+    for _ in range(2):
+        *_, terminated, _, _ = vector.step(np.zeros((2, 1)))
+    assert terminated.all()
+    vector.reset(seed=[4, None], options={"reset_mask": np.array([True, False])})
+    _, found, *_ = vector.step(np.zeros((2, 1)))
+    # Number 1 only began an episode.
+    np.testing.assert_allclose(found, [4.0, 0.0])
+
+
 def test_actions_are_read_within_their_bounds():
     env = LearnedReward(Counting(), lambda observation, action: action[..., 0])
     env.reset(seed=0)
@@ -88,6 +107,11 @@ def test_what_cannot_be_paid_is_refused(wrapper, given, message):
     inner = Counting() if wrapper is LearnedReward else SyncVectorEnv([Counting])
     with pytest.raises(ValueError, match=message):
         wrapper(inner, learned, **given)
+
+
+def test_discrete_actions_are_refused_when_it_is_wrapped():
+    with pytest.raises(ValueError, match=r"its actions are Discrete\(2\), not a Box"):
+        LearnedReward(gymnasium.make("CartPole-v1"), learned)
 
 
 def test_it_can_be_made_again_from_its_specification():

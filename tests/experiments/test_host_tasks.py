@@ -1,5 +1,6 @@
 """The command on somebody else's task of Gymnasium."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -9,8 +10,9 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from cmedirl_jax.runs import load_policy, load_reward
+from cmedirl_jax.runs import load_policy, load_reward, validation
 from cmedirl_jax.runs.cells import cell as cell_lib
+from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.training import tasks
 from experiments import pooled, presets, run_grid
@@ -88,6 +90,16 @@ def test_a_run_that_was_cut_off_goes_on_at_the_start_of_an_episode(tmp_path, mon
     assert evaluations["env_step"].max() == 240
 
 
+def test_experts_that_all_share_are_more_than_the_learners(tmp_path):
+    """On two devices, of which one has an idle slot."""
+    small = [*SMALL[:-2], "--devices", "2", "--expert", "best", "--experts.seeds", "4"]
+    folder = tmp_path / "run"
+    assert run_grid.main([*small, "--methods", "bc", "--out", str(folder)]) == 0
+    seeds = pl.read_parquet(folder / "seeds.parquet")
+    assert seeds["seed"].to_list() == [0, 1, 2]
+    assert seeds["expert_id"].n_unique() == 1
+
+
 def test_processes_of_their_own_change_no_number(run, tmp_path):
     folder = tmp_path / "run"
     command = [*SMALL, "--methods", "ddpg", "--out", str(folder), "--asynchronous"]
@@ -106,6 +118,8 @@ def test_processes_of_their_own_change_no_number(run, tmp_path):
         (["--env", "CartPole-v1"], r"--env: CartPole-v1: its actions are Discrete\(2\)"),
         (["--env", TASK, "--methods", "maxent-irl"], "maxent-irl: it needs a task in JAX"),
         (["--env", "Nothing-v0"], "--env: unknown environment 'Nothing-v0'"),
+        (["--env", TASK, "--group", "2"], "--group: .*all seeds together"),
+        (["--asynchronous"], "--asynchronous: MountainCarContinuous-v0 is a task in JAX"),
     ],
 )
 def test_what_the_host_cannot_do_is_refused(options, line, tmp_path, capsys):
@@ -115,8 +129,45 @@ def test_what_the_host_cannot_do_is_refused(options, line, tmp_path, capsys):
     assert error.count("\n") == 1
 
 
-def test_settings_are_found_by_a_tasks_name_alone(monkeypatch):
-    monkeypatch.setitem(tasks.TASKS, "Dock-v0", tasks.TaskSettings(steps=77))
-    assert presets.preset("tuned", env=TASK).max_steps == 77
+def test_several_processes_are_refused():
+    shared = dataclasses.replace(presets.preset("tuned", env=TASK), distributed=True)
+    with pytest.raises(UserError, match=r"--processes: .* is stepped on one host, by one process"):
+        validation.check(shared)
+
+
+@pytest.mark.parametrize("name", [TASK, "Dock-v0"])
+def test_a_tasks_settings_are_found_by_either_of_its_names(monkeypatch, name):
+    monkeypatch.setitem(tasks.TASKS, name, tasks.TaskSettings(steps=77))
+    config = presets.preset("tuned", env=TASK)
+    assert config.max_steps == 77
+    assert config.resolved_experts.settings == tasks.TaskSettings().experts
     written = {"config": {"env": TASK}, "scale": {"solved": 3}}
     assert run_folder.solved(Path("."), written) == 3.0
+
+
+def test_settings_may_stand_in_the_tasks_own_module(monkeypatch):
+    def imported(module):
+        assert module == "mine"
+        monkeypatch.setitem(tasks.TASKS, "Mine-v0", tasks.TaskSettings(steps=78))
+
+    monkeypatch.setattr(tasks.importlib, "import_module", imported)
+    assert presets.preset("tuned", env="mine:Mine-v0").max_steps == 78
+
+
+def test_experts_of_a_task_without_settings_train_as_its_learners_do():
+    config = run_grid.parse(["--env", TASK, "--agent.tau", "0.02"])
+    assert config.resolved_experts.settings.agent.tau == 0.02
+    known = run_grid.parse(["--env", "Pendulum-v1", "--agent.tau", "0.02"])
+    assert known.resolved_experts.settings == tasks.of("Pendulum-v1").experts
+    # The paper's learners do not learn: its experts are tuned.
+    paper = run_grid.parse(["--env", TASK, "--preset", "paper"])
+    assert paper.resolved_experts.settings == tasks.TaskSettings().experts
+
+
+def test_what_the_run_says_of_its_settings_and_experts(capsys, tmp_path):
+    command = [*SMALL, "--methods", "bc", "--out", str(tmp_path / "run")]
+    assert run_grid.main(command) == 0
+    output = " ".join(capsys.readouterr().out.split())
+    assert "Dock-v0 has no settings of its own: the car's, see docs/tasks.md" in output
+    assert re.search(r"\d of 3 experts solve the task; \d demonstrate for 3 learners", output)
+    assert "No episode was repeated" not in output

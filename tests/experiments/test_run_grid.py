@@ -124,7 +124,7 @@ def refused(main, tmp_path, capsys):
         (
             "--env Nothing-v0",
             "--env: unknown environment 'Nothing-v0'; there are: MountainCarContinuous-v0, "
-            "Pendulum-v1, PointMass-v0, and Gymnasium's, which says: "
+            "Pendulum-v1, PointMass-v0, and Gymnasium's. "
             "Environment `Nothing` doesn't exist.",
         ),
         ("--agent.tau 0", "--agent.tau: must be above 0 and at most 1, got 0.0"),

@@ -9,7 +9,6 @@ import scipy.stats
 
 from cmedirl_jax import envs, networks, training
 from cmedirl_jax.training import evaluation, host
-from cmedirl_jax.training.settings import Settings
 from tests.support import host_tasks, pools
 from tests.support.trainers import SMALL
 
@@ -40,7 +39,7 @@ def test_fit_trains_and_evaluates_all_seeds():
 def test_episodes_are_played_from_the_given_starts():
     vector = DOCK.vector(2)
     pushes = np.array([[0.1], [1.0]])
-    found = host.rollouts(vector, lambda seen: pushes, np.array([3, 4, 3]), 60)
+    found = evaluation.rollout_on_host(lambda seen: pushes, vector, np.array([3, 4, 3]), 60)
     for index, seed in np.ndindex(2, 3):
         task = host_tasks.Dock()
         task.reset(seed=[3, 4, 3][seed])
@@ -81,15 +80,15 @@ def test_what_cannot_be_trained_is_refused(changes, message):
         host.fit(jax.random.key(0), DOCK, **given)
 
 
-@pytest.mark.statistical
 def test_the_pendulum_learns_alike_in_jax_and_through_the_host():
     """Both ways' policies are judged in JAX, on the same starts."""
     env = envs.make("Pendulum-v1")
-    many = {"seeds": 32, "steps": 750, "evaluate_every": 750, "evaluation_starts": 1}
+    few = {"steps": 300, "evaluate_every": 300, "evaluation_starts": 1, "settings": SMALL}
+    many = {"seeds": 32, **few}
     in_jax = jax.jit(lambda key: training.fit(key, env, "ddpg", **many))(jax.random.key(0))
     outside = envs.from_gymnasium("gymnasium:Pendulum-v1")
     through_host = host.fit(jax.random.key(1), outside, "ddpg", **many)
-    made = networks.make(env.spec, Settings().architecture)
+    made = networks.make(env.spec, SMALL.architecture)
 
     @jax.jit
     @jax.vmap

@@ -33,13 +33,9 @@ def begin(method, settings=SMALL):
     trainer = training.make(task, METHODS[method], settings, capacity=400)
     halves = host_loop.compile_halves(trainer, LIMIT)
     vector = task.vector(SEEDS)
-    keys = seeds.keys(jax.random.key(0), SEEDS)
-    first = stepping.reset(vector, np.asarray(halves.first_seeds(keys)))
-    begin_all = jax.vmap(
-        lambda key, start: trainer.init(key, data() if uses else None, 3, None, (None, start))
-    )
-    init = jax.jit(begin_all, out_shardings=halves.sharding)
-    return trainer, halves, vector, init(keys, first)
+    keys, pool = seeds.keys(jax.random.key(0), SEEDS), data() if uses else None
+    states = host_loop.begin(halves, trainer, vector, keys, pool, 3)
+    return trainer, halves, vector, states
 
 
 @pytest.mark.parametrize("method", ["ddpg", "hs-me-ddpg"])
@@ -98,6 +94,26 @@ def test_an_episode_that_is_cut_off_is_no_trajectory():
     assert states.sampler.source.count.tolist() == [1] * SEEDS
     assert states.sampler.source.start[:, 0].tolist() == [cut] * SEEDS
     assert states.sampler.source.length[:, 0].tolist() == [LIMIT] * SEEDS
+
+
+def test_an_interruption_between_two_episodes_changes_nothing():
+    limit = 30
+    task = envs.from_gymnasium("Dock-v0", max_episode_steps=limit)
+    trainer = training.make(task, METHODS["ddpg"], SMALL, capacity=400)
+    halves = host_loop.compile_halves(trainer, limit)
+    ends = []
+    for interrupted in (False, True):
+        vector = task.vector(SEEDS)
+        states = host_loop.begin(halves, trainer, vector, seeds.keys(jax.random.key(0), SEEDS))
+        states, _ = host_loop.run(halves, vector, states, None, np.arange(limit, dtype=np.int32))
+        assert states.episode_length.tolist() == [0] * SEEDS
+        if interrupted:
+            vector = task.vector(SEEDS)
+            start = stepping.reset(vector, np.asarray(halves.seeds(states, np.int32(limit - 1))))
+            states = halves.begin_episode((states, start), np.int32(limit))
+        later = np.arange(limit, 2 * limit, dtype=np.int32)
+        ends.append(host_loop.run(halves, vector, states, None, later)[0])
+    chex.assert_trees_all_equal(*ends)
 
 
 def test_a_task_on_the_host_is_not_run_nor_begun_in_jax():

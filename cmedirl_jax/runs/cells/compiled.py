@@ -33,8 +33,8 @@ class CompiledMethod(NamedTuple):
             its own from. It keeps its latest answer, which the next method asks for again.
         init: `(keys, networks, episodes, first, groups, data, n_demonstrations) -> TrainingState`
             `[slots, ...]`.
-        first: `(keys [slots]) -> first`: what the host knows of the first episodes; None for a task
-            in JAX.
+        first: `(keys [slots]) -> start or None`: the first observations of a task on the host; None
+            for a task in JAX, whose `init` resets it.
         run: `(state, groups, data, steps, max_episodes) -> (TrainingState, Log)`; the state is
             donated. Only the first `groups` groups of slots on each device are stepped.
         resume: `(state, step) -> state`: goes on from a checkpoint before step number `step`.
@@ -271,7 +271,7 @@ def compiler(
 
     on_host = isinstance(env, HostEnv)
     # Cells follow each other, and share the sub-environments that they train in.
-    vector = functools.cache(env.vector) if on_host else None
+    vector = host.Latest(env.vector) if on_host else None
 
     def group_of(architecture: Architecture, count: int) -> int:
         # One step of a task on the host is too short for groups to pay off.

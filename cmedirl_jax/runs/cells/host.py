@@ -14,8 +14,25 @@ from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.envs import HostEnv, stepping
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells.evaluator import Evaluator
-from cmedirl_jax.training import Log, Trainer, TrainingState, host, host_loop
+from cmedirl_jax.training import Log, Trainer, TrainingState, evaluation, host_loop
 from cmedirl_jax.types import EnvSpec
+
+
+class Latest:
+    """The sub-environments that were made last."""
+
+    def __init__(self, make: Callable[[int], VectorEnv]):
+        """`make` makes so many of them."""
+        self._make = make
+        self._vector: VectorEnv | None = None
+
+    def __call__(self, count: int) -> VectorEnv:
+        """So many; others that were made before are closed."""
+        if self._vector is None or self._vector.num_envs != count:
+            if self._vector is not None:
+                self._vector.close()
+            self._vector = self._make(count)
+        return self._vector
 
 
 class Steps:
@@ -66,14 +83,16 @@ def evaluator(env: HostEnv, architecture: Architecture, gather: Callable[[Any], 
     act = functools.partial(networks.policy, networks.make(env.spec, architecture))
     act_all = jax.jit(jax.vmap(act))
     # As many sub-environments as there are policies.
-    vector = functools.cache(env.vector)
+    vector = Latest(env.vector)
 
     def play(actors: Any, starts: np.ndarray):
         # All on one device: a step is too short to share.
         actors = jax.device_put(gather(actors))
         count = jax.tree.leaves(actors)[0].shape[0]
         limit = env.spec.max_episode_steps
-        return host.rollouts(vector(count), lambda seen: act_all(actors, seen), starts, limit)
+        return evaluation.rollout_on_host(
+            lambda seen: act_all(actors, seen), vector(count), starts, limit
+        )
 
     def on_starts(actors: Any, count: int, groups: int | None = None):
         del groups

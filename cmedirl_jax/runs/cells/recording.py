@@ -10,7 +10,7 @@ import numpy as np
 
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
-from cmedirl_jax.envs import Env, HostEnv, stepping
+from cmedirl_jax.envs import Env, HostEnv, playing
 from cmedirl_jax.types import Transition
 
 
@@ -108,7 +108,7 @@ def record_on_host(
     seeds = np.stack([jax.random.bits(key, (episodes,), jnp.uint32) for key in keys])
     with contextlib.closing(env.vector(len(keys))) as vector:
         played = list(
-            stepping.play(
+            playing.play(
                 vector, lambda seen: act_all(actors, seen), seeds, env.spec.max_episode_steps
             )
         )

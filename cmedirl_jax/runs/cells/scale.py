@@ -14,7 +14,7 @@ import numpy as np
 
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.demonstrations import Demonstrations
-from cmedirl_jax.envs import Env, HostEnv, Step, stepping
+from cmedirl_jax.envs import Env, HostEnv, Step, playing
 from cmedirl_jax.runs.cells import recording
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.training import evaluation
@@ -107,17 +107,18 @@ def random_return(env: Env | HostEnv, starts: int) -> float:
 def _random_on_host(env: HostEnv, starts: int) -> tuple[float, float]:
     """The mean return of random actions, and the standard deviation of a step's reward."""
     spec, generator = env.spec, np.random.default_rng(0)
-    seeds = np.repeat(np.arange(starts)[:, None], ROUNDS, axis=1)
+    # Sub-environment i plays from every `ROUNDS`-th start; processes of their own are many.
+    seeds = np.tile(np.arange(starts), ROUNDS).reshape(-1, ROUNDS).T
 
     def act(observations: np.ndarray) -> np.ndarray:
         shape = (len(observations), spec.action_dim)
         return generator.uniform(spec.action_low, spec.action_high, shape)
 
-    with contextlib.closing(env.vector(starts)) as vector:
+    with contextlib.closing(env.vector(ROUNDS)) as vector:
         rewards = np.concatenate(
             [
                 played.answer.reward[played.playing]
-                for played in stepping.play(vector, act, seeds, spec.max_episode_steps)
+                for played in playing.play(vector, act, seeds, spec.max_episode_steps)
             ]
         )
     return float(rewards.sum() / seeds.size), float(np.std(rewards))

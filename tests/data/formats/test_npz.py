@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from cmedirl_jax.data import demonstrations, formats
+from cmedirl_jax.data import demonstrations
+from cmedirl_jax.data.formats import npz as formats
 from cmedirl_jax.io import npz
 from cmedirl_jax.types import Demonstrations, Transition
 from tests.support import damages, pools

@@ -1,0 +1,54 @@
+"""What a format of demonstrations is."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from cmedirl_jax.types import Demonstrations, EnvSpec
+
+
+class Read(Protocol):
+    """Read demonstrations."""
+
+    def __call__(self, source: Any, env: str | EnvSpec | None) -> Demonstrations:
+        """Read them; `env` names their task where the source does not."""
+        ...
+
+
+class Format(NamedTuple):
+    """A format of demonstrations.
+
+    Attributes:
+        description: what it is, in a line.
+        recognises: `(source) -> bool`, by a look at a path's name or first bytes, an id or an
+            object in memory; raises nothing.
+        read: see `Read`. Raises ValueError for a source that is damaged or another format's,
+            OSError for one that cannot be read, ModuleNotFoundError where a package is missing.
+        write: `(path or id, demonstrations)`; None for a format that is only read.
+        package: the extra that it needs; None for none.
+    """
+
+    description: str
+    recognises: Callable[[Any], bool]
+    read: Read
+    write: Callable[[Any, Demonstrations], None] | None = None
+    package: str | None = None
+
+
+def is_file(source: Any, *endings: str) -> bool:
+    """Whether a source is the path of a file with one of these endings."""
+    if not isinstance(source, str | Path):
+        return False
+    path = Path(source)
+    return path.suffix.lower() in endings and path.is_file()
+
+
+def named(env: str | EnvSpec | None) -> str | EnvSpec:
+    """The task, for formats that do not hold its name.
+
+    Raises:
+        ValueError: if it was not given.
+    """
+    if env is None:
+        raise ValueError("it does not name its task: give env")
+    return env
