@@ -15,16 +15,17 @@ import numpy as np
 
 from cmedirl_jax import checks, ranges
 from cmedirl_jax.data.completion import clip, complete
-from cmedirl_jax.data.formats import FORMATS, load, read, save
+from cmedirl_jax.data.formats import FORMATS, load, parse, read, save
 from cmedirl_jax.data.formats.minari import from_minari, to_minari
 from cmedirl_jax.data.trajectories import from_trajectories
-from cmedirl_jax.data.validation import check, validate
+from cmedirl_jax.data.validation import absent, check, validate
 from cmedirl_jax.types import Demonstrations, DemonstrationSubset, Numeric, Transition
 
 __all__ = [
     "FORMATS",
     "DemonstrationSubset",
     "Demonstrations",
+    "absent",
     "at",
     "check",
     "clip",
@@ -34,6 +35,7 @@ __all__ = [
     "from_minari",
     "from_trajectories",
     "load",
+    "parse",
     "read",
     "returns",
     "sample",

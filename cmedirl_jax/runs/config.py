@@ -7,6 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 
 import tyro
 
+from cmedirl_jax.data.formats.reading import Actions
 from cmedirl_jax.ranges import Count, NotNegative, Range, Size
 from cmedirl_jax.runs.cluster.base import ClusterOptions
 from cmedirl_jax.training.methods import PAPER_METHODS
@@ -80,8 +81,10 @@ class StudyConfig:
         expert: Who demonstrates: each learner has an expert of its own (they share where there are
             fewer), or all share the best one that solved the task, the median one, or all of them
             alike.
-        demos: A demonstrations file to learn from; no experts are trained, and their options are
-            not read.
+        demos: Demonstrations to learn from: a file or folder of any format (docs/data.md), or the
+            id of a dataset of Minari's; no experts are trained, and their options are not read.
+        demos_format: Its format, where it does not look like what it is.
+        demos_actions: What happens to demonstrated actions out of bounds.
         check_demos: What is asked of that file. dynamics: that each step is the task's own, where
             the task can be set to an observation; spec: the task's name and bounds, and that steps
             follow each other, for tasks that draw random numbers; none: the task's sizes, for
@@ -118,6 +121,8 @@ class StudyConfig:
     out: Path | None = None
     expert: Expert = "each"
     demos: Path | None = None
+    demos_format: str | None = None
+    demos_actions: Actions = "refuse"
     check_demos: DemosCheck = "dynamics"
     env: str = "MountainCarContinuous-v0"
     asynchronous: bool = False

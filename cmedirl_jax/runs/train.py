@@ -188,7 +188,7 @@ def _note_scale(session: Session, pool: Demonstrations) -> float:
     """Measure the task's returns and rewards, say and store them; what counts as solved."""
     plan = session.plan
 
-    def measure() -> dict[str, float]:
+    def measure() -> dict[str, Any]:
         # What a run was begun with stays: its finished cells were judged by it.
         noted = run_folder.read(plan.folder).get("scale")
         if noted is not None:
@@ -199,12 +199,16 @@ def _note_scale(session: Session, pool: Demonstrations) -> float:
 
     found = scale.Scale(**session.cluster.from_writer(measure))
     session.console.print(
-        f"Returns: random actions {found.random:.4g}, best expert {found.expert:.4g}, solved from "
-        f"{found.solved:.4g}. Rewards of a step spread by {found.reward_spread_random:.2g} in "
-        f"random episodes, {found.reward_spread_demonstrated:.2g} in demonstrated ones",
+        f"Returns: random actions {found.random:.4g}, best expert {_known(found.expert)}, solved "
+        f"from {found.solved:.4g}. Rewards of a step spread by {found.reward_spread_random:.2g} in "
+        f"random episodes, {_known(found.reward_spread_demonstrated)} in demonstrated ones",
         highlight=False,
     )
     return found.solved
+
+
+def _known(number: float | None) -> str:
+    return "unknown" if number is None else f"{number:.4g}"
 
 
 def _train_experts(

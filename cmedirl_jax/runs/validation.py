@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from cmedirl_jax import checks, envs, networks, ranges
 from cmedirl_jax.agents.exploration import ExplorationSettings
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.data.formats.reading import Actions
 from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.runs.cells import pools
 from cmedirl_jax.runs.cells.pools import LearnersPool
@@ -22,7 +24,7 @@ from cmedirl_jax.runs.config import DemosCheck, Experts, StudyConfig
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import cells, plain
 from cmedirl_jax.tabular import imitation
-from cmedirl_jax.training import compose
+from cmedirl_jax.training import compose, needs
 from cmedirl_jax.training.compose import Algorithm
 from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.settings import Settings
@@ -100,15 +102,20 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool =
     env = envs.find(config.env, asynchronous=config.asynchronous)
     path, demos = config.demos, None
     if path is not None:
-        demos = cluster.pool_from_writer(lambda: load_demonstrations(path, env, config.check_demos))
+        demos = cluster.pool_from_writer(
+            lambda: load_demonstrations(
+                path, env, config.check_demos, config.demos_format, config.demos_actions
+            )
+        )
         assert demos is not None
+        _check_needs(config, demos)
         held = _held(path, demos)
         if fewer_will_do and held < max(config.n_demos):
             config = dataclasses.replace(config, n_demos=(held,))
         _check_enough(cells.asked(config.methods, config.n_demos), held)
     return Plan(
         folder=config.folder,
-        config=cluster.from_writer(lambda: describe(config)),
+        config=cluster.from_writer(lambda: describe(config, demos)),
         env=env,
         study=config.seed,
         asked=cells.asked(config.methods, config.n_demos),
@@ -123,13 +130,18 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool =
     )
 
 
-def describe(config: StudyConfig) -> dict[str, Any]:
-    """The fully resolved configuration as JSON values."""
+def describe(config: StudyConfig, demos: Demonstrations | None = None) -> dict[str, Any]:
+    """The fully resolved configuration as JSON values; `demos` are those that it names."""
     described = plain.plain(config)
-    if config.demos is not None:
-        # Another file under the same name is another configuration.
+    if config.demos is None:
+        return described
+    # Another file under the same name is another configuration.
+    if config.demos.is_file():
         with config.demos.open("rb") as file:
             described["demos_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+    elif demos is not None:
+        leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(demos[:3])]
+        described["demos_sha256"] = hashlib.sha256(b"".join(leaves)).hexdigest()
     return described
 
 
@@ -254,30 +266,38 @@ def _check_epsilon(settings: ExplorationSettings) -> None:
         raise UserError(f"--exploration.hot-start-factor: makes epsilon {largest:g}, above 1")
 
 
-def load_demonstrations(path: Path, env: Env | HostEnv, check: DemosCheck) -> Demonstrations:
-    """Read the file that `--demos` names.
+def load_demonstrations(
+    path: Path,
+    env: Env | HostEnv,
+    check: DemosCheck,
+    format: str | None = None,
+    actions: Actions = "refuse",
+) -> Demonstrations:
+    """Read what `--demos` names, and compute what it lacks where the task can.
 
     Args:
-        path: the file.
+        path: the file, the folder, or the id of a dataset.
         env: the task.
         check: what is asked of the demonstrations, see `StudyConfig`.
+        format: a name in `demonstrations.FORMATS`; default by its looks.
+        actions: what happens to actions out of bounds.
 
     Raises:
         UserError: if it is missing, damaged or foreign.
     """
     try:
-        pool = demonstrations.load(path)
-    except FileNotFoundError as error:
-        raise UserError(
-            f"--demos: there is no file {path}; give one that demonstrations.save wrote"
-        ) from error
-    except OSError as error:
-        raise UserError(f"--demos: {path}: {error.strerror}") from error
-    except ValueError as error:
+        pool = demonstrations.parse(str(path), format, env.spec)
+    except (FileNotFoundError, ModuleNotFoundError, ValueError) as error:
         raise UserError(f"--demos: {error}") from error
+    except OSError as error:
+        raise UserError(f"--demos: {path}: {error.strerror or error}") from error
+    if actions == "clip":
+        pool = demonstrations.clip(pool, env.spec)
     try:
         match check:
             case "dynamics":
+                demonstrations.validate(pool, env.spec)
+                pool = demonstrations.complete(pool, env)
                 demonstrations.check(pool, env)
             case "spec":
                 demonstrations.validate(pool, env.spec)
@@ -295,6 +315,15 @@ def load_demonstrations(path: Path, env: Env | HostEnv, check: DemosCheck) -> De
     if type(steps) is not int or not 0 <= steps < 2**63:
         raise UserError(f"--demos: {path}: expert_env_steps in its metadata is {steps!r}, no count")
     return pool
+
+
+def _check_needs(config: StudyConfig, pool: Demonstrations) -> None:
+    """Refuse demonstrations that lack what a method reads."""
+    for name in config.methods:
+        try:
+            needs.check(METHODS[name], config.settings, demonstrations.absent(pool))
+        except ValueError as error:
+            raise UserError(f"--methods {name}: {error}") from error
 
 
 def _held(path: Path, pool: Demonstrations) -> int:

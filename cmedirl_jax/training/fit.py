@@ -11,7 +11,7 @@ from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.data import demonstrations as demonstrations_lib
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env, HostEnv
-from cmedirl_jax.training import evaluation
+from cmedirl_jax.training import evaluation, needs
 from cmedirl_jax.training import seeds as seeds_lib
 from cmedirl_jax.training.evaluation import Evaluation
 from cmedirl_jax.training.initialise import TrainingState
@@ -79,6 +79,7 @@ def prepare(
     data, n = None, 0
     if demonstrations is not None and method.uses_demonstrations:
         demonstrations_lib.validate(demonstrations, spec)
+        needs.check(method, settings, demonstrations_lib.absent(demonstrations))
         agent = settings.agent
         data = hot_start.data(demonstrations, agent.discount, agent.reward_scale)
         n = len(data.episodes.start) if n_demonstrations is None else n_demonstrations

@@ -11,6 +11,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from cmedirl_jax.data import demonstrations
+from cmedirl_jax.data.formats import tables as tables_of_steps
 from cmedirl_jax.io import checkpoint
 from cmedirl_jax.runs import load_policy, load_reward, run, start, train, validation
 from cmedirl_jax.runs.cells import experts
@@ -141,11 +142,12 @@ def refused(main, tmp_path, capsys):
         ("--seed -1", "--seed: must be between 0 and 2^32 - 1, got -1"),
         (
             "--demos none.npz",
-            "--demos: there is no file none.npz; give one that demonstrations.save wrote",
+            "--demos: there is no file none.npz, nor a dataset of that name",
         ),
         (
             "--demos D4RL/door/human-v2",
-            "--demos: there is no file D4RL/door/human-v2; give one that demonstrations.save wrote",
+            "--demos: Minari has no dataset D4RL/door/human-v2 here; fetch it by: minari download "
+            "D4RL/door/human-v2",
         ),
         (
             f"--max-steps None --max-episodes {2**31 - 1}",
@@ -277,6 +279,36 @@ def test_a_demonstrations_file_that_cannot_be_used_is_refused(refused, demos, da
             pool = pools.scripted(3)._replace(metadata={"env": "Pendulum-v1"})
             demonstrations.save(demos, pool)
     assert refused("--demos", demos, "--n-demos", 1).startswith(f"--demos: {demos}: ")
+
+
+def test_demonstrations_of_any_format_are_those_of_our_own(main, demos, tmp_path):
+    table = tmp_path / "pool.csv"
+    tables_of_steps.write_table(table, pools.scripted(3))
+    small = ["--methods", "bc", "--seeds", 2, "--hot-start.steps", 5, "--n-demos", 3]
+    small += ["--architecture.hidden", 8]
+    for number, source in enumerate((demos, table)):
+        assert main(*SMOKE, *small, "--demos", source, "--out", tmp_path / f"run-{number}") == 0
+    evaluations = [pl.read_parquet(tmp_path / f"run-{n}" / "evaluations.parquet") for n in (0, 1)]
+    assert_frame_equal(*evaluations, rel_tol=1e-3, abs_tol=1e-3)
+
+
+def test_demonstrations_without_actions_are_for_what_does_not_read_them(main, refused, tmp_path):
+    table = tmp_path / "states.csv"
+    tables_of_steps.write_table(table, pools.scripted(3))
+    states = [f"{name}_{i}" for name in ("observation", "next_observation") for i in (0, 1)]
+    pl.read_csv(table).select("episode", "terminated", "truncated", *states).write_csv(table)
+    line = refused("--demos", table, "--n-demos", 3, "--methods", "hs-ddpg")
+    assert line.startswith("--methods hs-ddpg: hs-ddpg starts hot from demonstrated actions")
+    line = refused("--demos", table, "--n-demos", 3, "--methods", "me-ddpg")
+    assert line.endswith("give reward_network.inputs state")
+    small = ["--methods", "me-ddpg", "--reward-network.inputs", "state", "--seeds", 2]
+    small += ["--max-steps", 250, "--architecture.hidden", 8, "--n-demos", 3]
+    assert main(*SMOKE, *small, "--demos", table, "--out", tmp_path / "run") == 0
+    scale = json.loads((tmp_path / "run" / "config.json").read_text())["scale"]
+    assert scale["expert"] is None
+    assert scale["reward_spread_demonstrated"] is None
+    seeds = pl.read_parquet(tmp_path / "run" / "seeds.parquet")
+    assert not seeds["diverged"].any()
 
 
 @pytest.mark.parametrize(

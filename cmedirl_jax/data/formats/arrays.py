@@ -158,11 +158,14 @@ def of_d4rl_file(source: Any, env: str | EnvSpec | None) -> Demonstrations:
         return of_d4rl(read_npz(source, _D4RL, _D4RL_OPTIONAL), env)
     import h5py  # type: ignore[import-not-found]
 
-    with h5py.File(source) as file:
-        there: dict[str, Any] = {
-            name: file[name] for name in (*_D4RL, *_D4RL_OPTIONAL) if name in file
-        }
-        return of_d4rl({name: array[()] for name, array in there.items()}, env)
+    try:
+        with h5py.File(source) as file:
+            there: list[Any] = [(name, file.get(name)) for name in (*_D4RL, *_D4RL_OPTIONAL)]
+            found = {name: array[()] for name, array in there if array is not None}
+    except Exception as error:
+        # HDF5 raises many types of error for a damaged file.
+        raise ValueError(f"it is damaged ({' '.join(str(error).split())[:200]})") from error
+    return of_d4rl(found, env)
 
 
 def _holds(*names: str) -> Callable[[Any], bool]:

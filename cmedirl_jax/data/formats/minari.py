@@ -61,10 +61,12 @@ def from_minari(source: str | Path, env: str | EnvSpec | None = None) -> Demonst
         raise FileNotFoundError(
             f"Minari has no dataset {source} here; fetch it by: minari download {source}"
         ) from error
+    except Exception as error:
+        # Its storages raise many types of error for damaged files.
+        raise ValueError(f"it is damaged ({' '.join(str(error).split())[:200]})") from error
     known = dataset.storage.metadata
-    kept: dict[str, Any] = {
-        name: known[name] for name in _OF_DATASET if isinstance(known.get(name), str | float | int)
-    }
+    kept: dict[str, Any] = {name: known[name] for name in _OF_DATASET if name in known}
+    kept = {name: list(x) if isinstance(x, set | tuple) else x for name, x in kept.items()}
     seeds = [_seed(dataset, episode) for episode in episodes]
     if any(seed is not None for seed in seeds):
         kept["seeds"] = seeds

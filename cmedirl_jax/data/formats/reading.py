@@ -52,34 +52,59 @@ def read(
         actions: what happens to actions out of bounds: the pool is refused, or they are clipped.
 
     Raises:
+        ValueError: as `parse`, and for pools that do not fit the task.
+        OSError: as `parse`.
+        ModuleNotFoundError: as `parse`.
+    """
+    task = env.spec if isinstance(env, Env | HostEnv) else env
+    pool = parse(source, format, task)
+    if not isinstance(task, EnvSpec):
+        return pool
+    if actions == "clip":
+        pool = completion.clip(pool, task)
+    try:
+        validation.validate(pool, task)
+    except ValueError as error:
+        raise ValueError(f"{_shown(source)}: {error}") from error
+    return completion.complete(pool, env) if isinstance(env, Env | HostEnv) else pool
+
+
+def parse(
+    source: Any, format: str | None = None, env: str | EnvSpec | None = None
+) -> Demonstrations:
+    """Read demonstrations of any format; they are valid in themselves.
+
+    Args:
+        source: as in `read`.
+        format: likewise.
+        env: the task's name, or its specification, which state-only demonstrations need.
+
+    Raises:
         ValueError: naming the source and the format it was read as: for a source that no format
-            recognises, damaged or inconsistent ones, and pools that do not fit the task.
-        OSError: if a file cannot be read.
+            recognises, and for damaged or inconsistent ones.
+        OSError: if a file cannot be read, or is not there.
         ModuleNotFoundError: naming the extra that the format needs.
     """
     name = recognised(source) if format is None else format
-    chosen, task = FORMATS[name], env.spec if isinstance(env, Env | HostEnv) else env
-    shown = source if isinstance(source, str | Path) else f"the {type(source).__name__}"
+    chosen, shown = FORMATS[name], _shown(source)
     try:
-        pool = chosen.read(source, task)
+        pool = chosen.read(source, env)
         validation.validate(pool)
-        if isinstance(task, EnvSpec):
-            pool = _held_to(pool, task, env, actions)
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             f"{shown}: to read {chosen.description} install cmedirl-jax[{chosen.package}] ({error})"
         ) from error
     except ValueError as error:
+        if str(error).startswith(f"{shown}: "):
+            raise
         hint = "" if format else "; give format if it is another one"
-        raise ValueError(f"{shown}, read as {name}: {error}{hint}") from error
+        raise ValueError(f"{shown}: read as {name}, {error}{hint}") from error
     return pool
 
 
-def _held_to(pool: Demonstrations, spec: EnvSpec, env: Any, actions: Actions) -> Demonstrations:
-    if actions == "clip":
-        pool = completion.clip(pool, spec)
-    validation.validate(pool, spec)
-    return completion.complete(pool, env) if isinstance(env, Env | HostEnv) else pool
+def _shown(source: Any) -> str:
+    """A source in a message."""
+    return str(source) if isinstance(source, str | Path) else f"the {type(source).__name__}"
 
 
 def recognised(source: Any) -> str:
@@ -87,15 +112,22 @@ def recognised(source: Any) -> str:
 
     Raises:
         ValueError: for none.
+        FileNotFoundError: for a path that leads nowhere.
     """
     for name, format in FORMATS.items():
         if format.recognises(source):
             return name
-    found = (
-        f"{source}: no" if isinstance(source, str | Path) else f"a {type(source).__name__} is no"
-    )
+    shown, there = _shown(source), ", ".join(FORMATS)
+    if not isinstance(source, str | Path):
+        raise ValueError(f"{shown} is no demonstrations of a known format; there are: {there}")
+    path = Path(source)
+    if not path.exists():
+        raise FileNotFoundError(f"there is no file {shown}, nor a dataset of that name")
+    if not path.is_file() and not path.is_dir():
+        raise ValueError(f"{shown}: not a regular file")
     held = sorted(arrays.names_in(source))
-    arrays_held = f", with arrays {', '.join(held)}" * bool(held)
-    raise ValueError(
-        f"{found} demonstrations of a known format{arrays_held}; there are: {', '.join(FORMATS)}"
-    )
+    if path.suffix == ".npz" and not held:
+        # Damaged, which reading it will say.
+        return "npz"
+    holding = f" (it holds {', '.join(held)})" * bool(held)
+    raise ValueError(f"{shown}: no demonstrations of a known format{holding}; there are: {there}")

@@ -20,6 +20,8 @@ import numpy as np
 
 from cmedirl_jax.data.formats.base import Format, is_file, named
 from cmedirl_jax.data.trajectories import from_trajectories
+from cmedirl_jax.data.validation import absent
+from cmedirl_jax.io import atomic
 from cmedirl_jax.types import Demonstrations, EnvSpec
 
 _NUMBERED = re.compile(r"(observation|action|next_observation)_(\d+)")
@@ -101,40 +103,59 @@ def _rows_of(episode: np.ndarray) -> list[np.ndarray]:
 
 
 def write_table(path: str | Path, demonstrations: Demonstrations) -> None:
-    """Write a pool as a CSV or Parquet file, by the name's ending.
+    """Write a pool as a CSV or Parquet file, by the name's ending; what is absent has no column.
 
     Raises:
         ValueError: for another ending.
         OSError: if it cannot be written.
     """
-    import io
-
-    import polars as pl
-
-    from cmedirl_jax.io import atomic
-
-    made = demonstrations.transition
-    episode = np.asarray(demonstrations.episode)
-    columns: dict[str, Any] = {"episode": episode}
+    made, columns = demonstrations.transition, {"episode": np.asarray(demonstrations.episode)}
+    lacking = absent(demonstrations)
     for name in ("observation", "action", "next_observation"):
-        values = np.asarray(getattr(made, name))
-        if not np.isnan(values).all():
+        if name not in lacking:
+            values = np.asarray(getattr(made, name))
             columns |= {f"{name}_{index}": values[:, index] for index in range(values.shape[1])}
-    if not np.isnan(made.reward).all():
+    if "reward" not in lacking:
         columns["reward"] = np.asarray(made.reward)
     columns["terminated"] = np.asarray(made.terminated)
     columns["truncated"] = np.asarray(demonstrations.truncated)
-    table, content = pl.DataFrame(columns), io.BytesIO()
-    if is_table(path) is False:
+    _write(Path(path), columns)
+
+
+def write_template(path: str | Path, spec: EnvSpec) -> None:
+    """Write an episode of two steps of zeros, with every column that a task's table may have.
+
+    Raises:
+        ValueError: for an ending that is neither .csv nor .parquet.
+        OSError: if it cannot be written.
+    """
+
+    def numbered(name: str, count: int) -> dict[str, list[float]]:
+        return {f"{name}_{index}": [0.0, 0.0] for index in range(count)}
+
+    columns = {
+        "episode": [0, 0],
+        **numbered("observation", spec.observation_dim),
+        **numbered("action", spec.action_dim),
+        "reward": [0.0, 0.0],
+        "terminated": [False, True],
+        "truncated": [False, False],
+        **numbered("next_observation", spec.observation_dim),
+    }
+    _write(Path(path), columns)
+
+
+def _write(path: Path, columns: dict[str, Any]) -> None:
+    import polars as pl
+
+    if path.suffix.lower() not in (".csv", ".parquet"):
         raise ValueError(f"{path}: give a name that ends in .csv or .parquet")
-    table.write_csv(content) if str(path).endswith(".csv") else table.write_parquet(content)
-    with atomic.replacing(Path(path)) as partial:
-        partial.write_bytes(content.getvalue())
-
-
-def is_table(path: str | Path) -> bool:
-    """Whether a path is that of a table by its ending."""
-    return Path(path).suffix.lower() in (".csv", ".parquet")
+    table = pl.DataFrame(columns)
+    with atomic.replacing(path) as partial:
+        if path.suffix.lower() == ".csv":
+            table.write_csv(partial)
+        else:
+            table.write_parquet(partial)
 
 
 def of_imitation_folder(source: Any, env: str | EnvSpec | None) -> Demonstrations:

@@ -32,17 +32,17 @@ class Scale(NamedTuple):
 
     Attributes:
         random: return of actions that are drawn uniformly within their bounds.
-        expert: return of the best expert that demonstrates.
+        expert: return of the best expert that demonstrates; None where no rewards are known.
         solved: the return that counts as solved: the task's own, where it has one.
         reward_spread_random: standard deviation of a step's reward, over random episodes.
-        reward_spread_demonstrated: the same, over the demonstrations.
+        reward_spread_demonstrated: the same, over the demonstrations; None without rewards.
     """
 
     random: float
-    expert: float
+    expert: float | None
     solved: float
     reward_spread_random: float
-    reward_spread_demonstrated: float
+    reward_spread_demonstrated: float | None
 
 
 def measure(env: Env | HostEnv, pool: Demonstrations, starts: int) -> Scale:
@@ -59,24 +59,27 @@ def measure(env: Env | HostEnv, pool: Demonstrations, starts: int) -> Scale:
             actions.
     """
     named = np.array(pool.metadata.get("expert_returns", []), float)
-    returns = named if np.isfinite(named).any() else demonstrations_lib.returns(pool).mean()
-    expert = float(np.nanmax(returns))
+    known = "reward" not in demonstrations_lib.absent(pool)
+    expert = float(np.nanmax(named)) if np.isfinite(named).any() else None
+    if expert is None and known:
+        expert = float(demonstrations_lib.returns(pool).mean())
     if isinstance(env, HostEnv):
         random, spread = _random_on_host(env, starts)
     else:
         random, spread = random_return(env, starts), _random_spread(env)
     threshold = env.spec.reward_threshold
-    if threshold is None and not expert > random:
+    if threshold is None and (expert is None or not expert > random):
+        returned = "have no rewards" if expert is None else f"return {expert:.4g}"
         raise UserError(
-            f"--demos: they return {expert:.4g}, random actions {random:.4g}: nothing says what "
+            f"--demos: they {returned}, random actions {random:.4g}: nothing says what "
             f"counts as solved in {env.spec.id}"
         )
     return Scale(
         random=random,
         expert=expert,
-        solved=solved(random, expert) if threshold is None else threshold,
+        solved=threshold if threshold is not None else solved(random, expert or random),
         reward_spread_random=spread,
-        reward_spread_demonstrated=float(np.std(pool.transition.reward)),
+        reward_spread_demonstrated=float(np.std(pool.transition.reward)) if known else None,
     )
 
 

@@ -32,7 +32,8 @@ CELLS_ASKED = ("methods", "n_demos", "seeds")
 _LOCK = ".lock"
 NOT_COMPARED = (
     *("out", "grid", "devices", "distributed", "coordinator", "processes", "process_id"),
-    *("checkpoint_every", "check_demos", "asynchronous", *CELLS_ASKED),
+    *("checkpoint_every", "check_demos", "demos_format", "demos_actions", "asynchronous"),
+    *CELLS_ASKED,
 )
 """The options that runs of one configuration may differ in."""
 
@@ -174,7 +175,7 @@ def note_cells_asked(folder: Path, config: dict[str, Any]) -> None:
     _write(folder, written | {"config": now})
 
 
-def note_scale(folder: Path, scale: dict[str, float]) -> None:
+def note_scale(folder: Path, scale: dict[str, Any]) -> None:
     """Write to config.json where the task's returns lie, see `cells.scale.Scale`."""
     _write(folder, read(folder) | {"scale": scale})
 
