@@ -97,9 +97,10 @@ def as_stable_baselines(trajectories, path):
 def as_d4rl(trajectories, path):
     del path
     ends = [np.arange(len(each["actions"])) == len(each["actions"]) - 1 for each in trajectories]
-    over = np.concatenate(
-        [end & t["terminated"] for end, t in zip(ends, trajectories, strict=True)]
-    )
+    lengths = [len(each["actions"]) for each in trajectories]
+    over = np.repeat([each["terminated"] for each in trajectories], lengths) & np.concatenate(ends)
+    unfinished = np.arange(len(over)) == len(over) - 1
+    unfinished &= not trajectories[-1].get("truncated", True)
     arrays = {
         "observations": np.concatenate([each["observations"][:-1] for each in trajectories]),
         "actions": np.concatenate([each["actions"] for each in trajectories]),
