@@ -12,7 +12,7 @@ import pytest
 
 from cmedirl_jax import envs
 from cmedirl_jax.types import EnvSpec
-from tests.support import compiling
+from tests.support import compiling, runs
 
 # The first example of a test compiles, so deadlines would only measure the compiler.
 hypothesis.settings.register_profile("reproducible", deadline=None, derandomize=True)
@@ -108,6 +108,14 @@ def skewed_spec():
         max_episode_steps=10,
         reward_threshold=0.0,
     )
+
+
+@pytest.fixture(scope="session")
+def untrained_run(tmp_path_factory):
+    """A run's folder, which no test changes for the others."""
+    folder = tmp_path_factory.mktemp("run")
+    runs.save(folder)
+    return folder
 
 
 @pytest.fixture(scope="module")

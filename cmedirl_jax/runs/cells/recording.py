@@ -1,7 +1,7 @@
 """Recording noise-free episodes of policies as a pool of demonstrations."""
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -11,6 +11,7 @@ import numpy as np
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env, HostEnv, playing
+from cmedirl_jax.envs.playing import Played
 from cmedirl_jax.types import Transition
 
 
@@ -107,15 +108,19 @@ def record_on_host(
     act_all = jax.jit(jax.vmap(act))
     seeds = np.stack([jax.random.bits(key, (episodes,), jnp.uint32) for key in keys])
     with contextlib.closing(env.vector(len(keys))) as vector:
-        played = list(
+        return of_steps(
             playing.play(
                 vector, lambda seen: act_all(actors, seen), seeds, env.spec.max_episode_steps
             )
         )
+
+
+def of_steps(played: Iterable[Played]) -> list[Demonstrations]:
+    """What sub-environments played, as a pool of each, without metadata."""
     steps = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *played)
 
-    def pool(actor: int) -> Demonstrations:
-        own = jax.tree.map(lambda leaf: leaf[actor][steps.playing[actor]], steps)
+    def pool(player: int) -> Demonstrations:
+        own = jax.tree.map(lambda leaf: leaf[player][steps.playing[player]], steps)
         transition = Transition(
             own.observation,
             own.action,
@@ -125,7 +130,7 @@ def record_on_host(
         )
         return Demonstrations(transition, own.truncated, own.episode.astype(np.int32), {})
 
-    return [pool(actor) for actor in range(len(keys))]
+    return [pool(player) for player in range(len(steps.playing))]
 
 
 def flatten(transition: Transition, running: np.ndarray, truncated: np.ndarray) -> Demonstrations:

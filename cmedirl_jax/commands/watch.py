@@ -1,12 +1,11 @@
-"""`python -m experiments.film RUN`: an episode of a learned policy, drawn by Gymnasium, as a GIF.
+"""Show an episode of a policy that a run has learned, as a GIF or in a window.
 
-It needs what Gymnasium draws the task with: `pip install -e '.[gymnasium]'`.
+Example: cmedirl watch results/tuned --method hs-me-ddpg --seed 3 --out car.gif
 """
 
 import dataclasses
 import io
 import os
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,9 +17,7 @@ import tyro
 from PIL import Image
 
 from cmedirl_jax.ranges import Count, Size
-from cmedirl_jax.runs import start
-from cmedirl_jax.runs.console import ending, screen
-from cmedirl_jax.runs.console.options import read
+from cmedirl_jax.runs.console import screen
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.load import load_policy
 from cmedirl_jax.runs.storage import folder as run_folder
@@ -32,7 +29,7 @@ MILLISECONDS = 40
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Which policy, and where to write its film.
+    """Which policy, and where to show it.
 
     Attributes:
         folder: A run's folder.
@@ -42,6 +39,7 @@ class Options:
         reset_seed: Gymnasium's, for the start of the episode.
         every: Steps from one frame to the next.
         width: Of the picture, in pixels.
+        window: Show it in a window, and write no file.
         out: A GIF file.
     """
 
@@ -52,42 +50,51 @@ class Options:
     reset_seed: Count = 0
     every: Size = 2
     width: Size = 300
-    out: Path = Path("film.gif")
+    window: bool = False
+    out: Path = Path("episode.gif")
 
 
-@ending.in_a_line("film")
-def main(arguments: Sequence[str] | None = None) -> int:
+def run(options: Options) -> int:
     """Run the command; returns its exit code."""
-    options = read(Options, "experiments.film", __doc__, arguments)
     outputs.check("out", options.out)
     task = run_folder.read(options.folder)["config"]["env"]
-    # Frames are drawn in memory: no screen is looked for.
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    start.devices()
     try:
         policy = load_policy(options.folder, options.method, options.seed, options.n_demos)
     except ValueError as error:
         raise UserError(" ".join(str(error).split())) from error
-    frames = of_episode(jax.jit(policy), task, options.reset_seed, options.every)
-    outputs.write(options.out, gif(frames, options.width))
-    screen.say(screen.console(), f"Film: {options.out}, {len(frames)} frames")
+    mode = "human" if options.window else "rgb_array"
+    if not options.window:
+        # Frames are drawn in memory: no screen is looked for.
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    frames = of_episode(jax.jit(policy), task, options.reset_seed, options.every, mode)
+    if not options.window:
+        outputs.write(options.out, gif(frames, options.width))
+        screen.say(screen.console(), f"{options.out}: {len(frames)} frames")
     return 0
 
 
 def of_episode(
-    policy: Callable[[Any], jax.Array], task: str, reset_seed: int, every: int
+    policy: Callable[[Any], jax.Array],
+    task: str,
+    reset_seed: int,
+    every: int,
+    render_mode: str = "rgb_array",
 ) -> list[np.ndarray]:
     """Every so many frames `[height, width, 3]` uint8 of an episode, and its last one.
+
+    With `render_mode` "human" they go to a window, and None stands for each.
 
     Raises:
         UserError: if Gymnasium cannot draw the task.
     """
     try:
-        env = gymnasium.make(task, render_mode="rgb_array")
+        env = gymnasium.make(task, render_mode=render_mode)
         observation, _ = env.reset(seed=reset_seed)
-        frames, ended, steps = [env.render()], False, 0
+        frames: list[Any] = [env.render()]
+        ended, steps = False, 0
         while not ended:
-            observation, _, terminated, truncated, _ = env.step(np.asarray(policy(observation)))
+            action = np.asarray(policy(np.asarray(observation, np.float32)), np.float32)
+            observation, _, terminated, truncated, _ = env.step(action)
             ended, steps = terminated or truncated, steps + 1
             if ended or steps % every == 0:
                 frames.append(env.render())
@@ -95,7 +102,7 @@ def of_episode(
     except (gymnasium.error.Error, TypeError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{task}: Gymnasium cannot draw it ({reason})") from error
-    return [np.asarray(frame) for frame in frames]
+    return frames
 
 
 def gif(frames: Sequence[np.ndarray], width: int) -> bytes:
@@ -117,7 +124,3 @@ def gif(frames: Sequence[np.ndarray], width: int) -> bytes:
         optimize=True,
     )
     return content.getvalue()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,1 @@
+"""What is installed as `cmedirl`: demonstrations, and what a run has learned."""

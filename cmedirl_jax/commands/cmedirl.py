@@ -1,0 +1,60 @@
+"""Learn rewards from demonstrations. `cmedirl COMMAND --help` says more of each command."""
+
+import dataclasses
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+from cmedirl_jax import ranges
+from cmedirl_jax.commands import convert, evaluate, inspect, record, template, watch
+from cmedirl_jax.runs.console import ending
+from cmedirl_jax.runs.errors import UserError
+
+Demos = (
+    Annotated[inspect.Options, tyro.conf.subcommand("inspect", description=inspect.__doc__)]
+    | Annotated[convert.Options, tyro.conf.subcommand("convert", description=convert.__doc__)]
+    | Annotated[record.Options, tyro.conf.subcommand("record", description=record.__doc__)]
+    | Annotated[template.Options, tyro.conf.subcommand("template", description=template.__doc__)]
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class DemosOptions:
+    """Demonstrations: look at them, convert them, record some, or begin with a template."""
+
+    what: tyro.conf.OmitSubcommandPrefixes[Demos]
+
+
+Command = (
+    Annotated[DemosOptions, tyro.conf.subcommand("demos")]
+    | Annotated[evaluate.Options, tyro.conf.subcommand("evaluate", description=evaluate.__doc__)]
+    | Annotated[watch.Options, tyro.conf.subcommand("watch", description=watch.__doc__)]
+)
+_RUNS = {
+    inspect.Options: inspect.run,
+    convert.Options: convert.run,
+    record.Options: record.run,
+    template.Options: template.run,
+    evaluate.Options: evaluate.run,
+    watch.Options: watch.run,
+}
+
+
+@ending.in_a_line("cmedirl")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    # A task of the user's own, MODULE:NAME, may lie in the current folder, as with `python -m`.
+    sys.path.insert(0, os.getcwd())
+    chosen = tyro.cli(
+        tyro.conf.OmitArgPrefixes[Command],  # type: ignore[valid-type]
+        prog="cmedirl",
+        description=__doc__,
+        args=None if arguments is None else list(arguments),
+    )
+    options = chosen.what if isinstance(chosen, DemosOptions) else chosen
+    for name, wrong in ranges.out_of_range(options):
+        raise UserError(f"--{name.replace('_', '-')}: {wrong}")
+    return _RUNS[type(options)](options)
