@@ -15,7 +15,10 @@ from cmedirl_jax.types import EnvSpec
 from tests.support import compiling, runs
 
 # The first example of a test compiles, so deadlines would only measure the compiler.
-hypothesis.settings.register_profile("reproducible", deadline=None, derandomize=True)
+# The examples are the same in every run: more of them would only be slower.
+hypothesis.settings.register_profile(
+    "reproducible", deadline=None, derandomize=True, max_examples=50
+)
 hypothesis.settings.load_profile("reproducible")
 
 MOST_MEMORY = 1.4e9
@@ -35,6 +38,8 @@ LONGEST = (
 
 def pytest_configure():
     compiling.be_quick()
+    # Fixtures of a module come before what a test's own fixture sets.
+    jax.config.update("jax_disable_most_optimizations", True)
     # A shell starts its background jobs with SIGINT ignored, which tests of signals cannot be.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -127,11 +127,11 @@ def _figure(pool: Demonstrations, env: Env | HostEnv | None) -> drawing.Figure:
     columns = _columns(pool, env)
     rows = -(-len(columns) // 3)
     figure = drawing.Figure(figsize=(9, 2.4 * rows), layout="constrained")
-    axes = figure.subplots(rows, 3, squeeze=False).flat
+    axes = list(figure.subplots(rows, 3, squeeze=False).flat)
     for place, (name, values, _) in zip(axes, columns, strict=False):
         place.hist(values, bins=40)
         place.set_xlabel(name)
         place.set_ylabel("episodes" if name in ("length", "return") else "steps")
-    for place in list(axes)[len(columns) :]:
+    for place in axes[len(columns) :]:
         place.set_visible(False)
     return figure

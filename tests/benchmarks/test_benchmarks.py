@@ -319,7 +319,8 @@ def test_workloads_are_plain_data():
     assert Workload(**{**options, "hidden": tuple(options["hidden"])}) == workload
 
 
-def test_a_process_of_the_scaling_benchmark_times_its_turns():
+def test_a_process_of_the_scaling_benchmark_times_its_turns(monkeypatch):
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     job = {"method": "ddpg", "seeds_count": 1, "devices": 1, "coordinator": "", "processes": 1}
     worker = scaling.start(job | {"index": 0})
     try:
