@@ -5,50 +5,34 @@ Example: cmedirl evaluate results/tuned --method hs-me-ddpg --seed 3 --starts 10
 
 import contextlib
 import dataclasses
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import numpy as np
-import tyro
 
 from cmedirl_jax.commands import sources
 from cmedirl_jax.envs import Env, HostEnv
-from cmedirl_jax.ranges import Count, Size
+from cmedirl_jax.ranges import Size
 from cmedirl_jax.runs.console import screen
-from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.load import load_policy
-from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.training import evaluation
 from cmedirl_jax.training.evaluation import Rollouts
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
-    """Which policy.
+class Options(sources.PolicyOptions):
+    """Which policy, and from how many starts.
 
     Attributes:
-        folder: A run's folder.
-        method: Which method's policy.
-        seed: Of which learner.
-        n_demos: Demonstrations of the learner, where the run has several numbers of them.
         starts: Start states, which weigh as the task draws them.
     """
 
-    folder: Annotated[Path, tyro.conf.Positional]
-    method: str = "hs-me-ddpg"
-    seed: Count = 0
-    n_demos: Size | None = None
     starts: Size = 10
 
 
 def run(options: Options) -> int:
     """Run the command; returns its exit code."""
-    env = sources.task(run_folder.read(options.folder)["config"]["env"])
-    try:
-        policy = load_policy(options.folder, options.method, options.seed, options.n_demos)
-    except ValueError as error:
-        raise UserError(" ".join(str(error).split())) from error
+    name, policy = sources.policy(options.folder, options.method, options.seed, options.n_demos)
+    env = sources.task(name)
     found = rollouts(env, policy, options.starts)
     screen.say(
         screen.console(),

@@ -24,8 +24,6 @@ from cmedirl_jax.ranges import Count, Size
 from cmedirl_jax.runs.cells import recording
 from cmedirl_jax.runs.console import screen
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.load import load_policy
-from cmedirl_jax.runs.storage import folder as run_folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,12 +75,10 @@ def _demonstrator(options: Options) -> tuple[str, Callable[[np.ndarray], Any], s
     if (options.run is None) == (options.policy is None):
         raise UserError("give either --run, or --policy and --env")
     if options.run is not None:
-        task = run_folder.read(Path(options.run))["config"]["env"]
-        try:
-            policy = load_policy(options.run, options.method, options.seed, options.n_demos)
-        except ValueError as error:
-            raise UserError(" ".join(str(error).split())) from error
-        return task, jax.jit(policy), f"{options.method}, seed {options.seed}, of {options.run}"
+        name, policy = sources.policy(
+            Path(options.run), options.method, options.seed, options.n_demos
+        )
+        return name, jax.jit(policy), f"{options.method}, seed {options.seed}, of {options.run}"
     if options.env is None:
         raise UserError("--env: name the task that --policy acts in")
     assert options.policy is not None

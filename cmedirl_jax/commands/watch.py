@@ -8,19 +8,17 @@ import io
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium
 import jax
 import numpy as np
-import tyro
 from PIL import Image
 
+from cmedirl_jax.commands import sources
 from cmedirl_jax.ranges import Count, Size
 from cmedirl_jax.runs.console import screen
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.load import load_policy
-from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import outputs
 
 MILLISECONDS = 40
@@ -28,14 +26,10 @@ MILLISECONDS = 40
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(sources.PolicyOptions):
     """Which policy, and where to show it.
 
     Attributes:
-        folder: A run's folder.
-        method: Which method's policy.
-        seed: Of which learner.
-        n_demos: Demonstrations of the learner, where the run has several numbers of them.
         reset_seed: Gymnasium's, for the start of the episode.
         every: Steps from one frame to the next.
         width: Of the picture, in pixels.
@@ -43,10 +37,6 @@ class Options:
         out: A GIF file.
     """
 
-    folder: Annotated[Path, tyro.conf.Positional]
-    method: str = "hs-me-ddpg"
-    seed: Count = 0
-    n_demos: Size | None = None
     reset_seed: Count = 0
     every: Size = 2
     width: Size = 300
@@ -57,11 +47,7 @@ class Options:
 def run(options: Options) -> int:
     """Run the command; returns its exit code."""
     outputs.check("out", options.out)
-    task = run_folder.read(options.folder)["config"]["env"]
-    try:
-        policy = load_policy(options.folder, options.method, options.seed, options.n_demos)
-    except ValueError as error:
-        raise UserError(" ".join(str(error).split())) from error
+    task, policy = sources.policy(options.folder, options.method, options.seed, options.n_demos)
     mode = "human" if options.window else "rgb_array"
     if not options.window:
         # Frames are drawn in memory: no screen is looked for.
