@@ -21,7 +21,7 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("reproducible")
 
-MOST_MEMORY = 1.4e9
+MOST_MEMORY = 1.7e9
 """Resident bytes of a process above which compiled programs are freed between tests."""
 
 # Longest first: one of these files started last would keep a worker alone at the end.

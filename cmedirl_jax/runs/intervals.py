@@ -82,10 +82,27 @@ def mean(
         interval = result.confidence_interval
         return Interval(estimate, float(interval.low), float(interval.high))
     drawn = rng.integers(len(groups), size=(RESAMPLES, len(groups)))
-    found = [statistic(np.concatenate([groups[one] for one in row])) for row in drawn]
+    found = _of_clusters(groups, drawn, statistic)
     tail = (1 - confidence) / 2
     low, high = np.quantile(found, [tail, 1 - tail])
     return Interval(estimate, float(low), float(high))
+
+
+def _of_clusters(groups: list[np.ndarray], drawn: np.ndarray, statistic: Statistic) -> np.ndarray:
+    """The statistic `[R]` of resamples that each hold the clusters `drawn` `[R, C]`."""
+    values, sizes = np.concatenate(groups), np.array([len(group) for group in groups])
+    starts, lengths = np.cumsum(sizes) - sizes, sizes[drawn].sum(axis=1)
+    # Every resample's rows of `values`, one resample after the other.
+    counts = sizes[drawn].ravel()
+    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    rows = np.split(np.repeat(starts[drawn].ravel(), counts) + within, np.cumsum(lengths)[:-1])
+    # Resamples of one length are one array.
+    found = np.empty(len(drawn))
+    for length in np.unique(lengths):
+        alike = np.flatnonzero(lengths == length)
+        samples = values[np.stack([rows[index] for index in alike])]
+        found[alike] = statistic(samples, axis=-1)
+    return found
 
 
 def _groups(values: np.ndarray, clusters: np.ndarray | None) -> list[np.ndarray]:

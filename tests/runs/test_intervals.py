@@ -165,3 +165,15 @@ def test_the_log_rank_test_rejects_equal_laws_at_its_level():
         return intervals.logrank(*np.ceil(np.random.default_rng(trial).exponential(3.0, (2, 50))))
 
     assert np.mean([p_value(trial) <= 0.05 for trial in range(300)]) <= 0.08
+
+
+@given(data=st.data())
+def test_resampled_clusters_are_those_that_were_drawn(data):
+    sizes = data.draw(st.lists(st.integers(1, 4), min_size=2, max_size=5))
+    groups = [np.arange(size) + 10.0 * index for index, size in enumerate(sizes)]
+    one = st.integers(0, len(sizes) - 1)
+    drawn = np.array(data.draw(st.lists(st.tuples(*[one] * len(sizes)), min_size=1, max_size=6)))
+    for statistic in (np.mean, np.max):
+        expected = [statistic(np.concatenate([groups[i] for i in row])) for row in drawn]
+        found = intervals._of_clusters(groups, drawn, statistic)
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
