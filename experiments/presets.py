@@ -68,8 +68,9 @@ def preset(name: str, grid: str = "main", env: str = CAR) -> StudyConfig:
     """
     config = PRESETS.get(name, PRESETS["tuned"])
     if env != CAR:
-        task, known = tasks.of(env), tasks.found(env) is not None
-        own = task.experts if known or config.preset == "paper" else None
+        found = tasks.found(env)
+        task = found or tasks.TaskSettings()
+        own = task.experts if found or config.preset == "paper" else None
         experts = dataclasses.replace(config.experts, settings=own)
         if config.preset == "tuned":
             experts = dataclasses.replace(experts, steps=task.expert_steps)

@@ -11,7 +11,7 @@ import tyro
 
 from cmedirl_jax.commands import sources
 from cmedirl_jax.data import demonstrations
-from cmedirl_jax.data.formats import minari, tables
+from cmedirl_jax.data.formats.base import Format
 from cmedirl_jax.data.formats.reading import Actions
 from cmedirl_jax.runs.console import screen
 from cmedirl_jax.runs.errors import UserError
@@ -60,26 +60,28 @@ def check_target(target: str) -> None:
     Raises:
         UserError: naming what there is.
     """
-    if Path(target).suffix.lower() in (".npz", ".csv", ".parquet"):
+    _format_of(target)
+    if Path(target).suffix:
         outputs.check("target", Path(target))
-    elif not minari.ID.fullmatch(target):
-        raise UserError(f"{target}: it ends in none of .npz, .csv, .parquet, nor in -vN as an id")
 
 
 def write(target: str, pool: demonstrations.Demonstrations, spec: EnvSpec) -> None:
-    """Write a pool, by the target's ending.
+    """Write a pool in the format that the target's name says.
 
     Raises:
-        UserError: if Minari is not installed, or refuses it.
+        UserError: if what writes it is not installed, or refuses it.
         OSError: if a file cannot be written.
     """
-    suffix = Path(target).suffix.lower()
-    if suffix == ".npz":
-        demonstrations.save(target, pool)
-    elif suffix in (".csv", ".parquet"):
-        tables.write_table(target, pool)
-    else:
-        try:
-            demonstrations.to_minari(pool, target, spec=spec)
-        except (ModuleNotFoundError, ValueError) as error:
-            raise UserError(f"{target}: {' '.join(str(error).split())}") from error
+    chosen = _format_of(target)
+    assert chosen.write is not None
+    try:
+        chosen.write(target, pool, spec)
+    except (ModuleNotFoundError, ValueError) as error:
+        raise UserError(f"{target}: {' '.join(str(error).split())}") from error
+
+
+def _format_of(target: str) -> Format:
+    for each in demonstrations.FORMATS.values():
+        if each.writes is not None and each.writes(target):
+            return each
+    raise UserError(f"{target}: it ends in none of .npz, .csv, .parquet, nor in -vN as an id")

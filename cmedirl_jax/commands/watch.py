@@ -46,7 +46,8 @@ class Options(sources.PolicyOptions):
 
 def run(options: Options) -> int:
     """Run the command; returns its exit code."""
-    outputs.check("out", options.out)
+    if not options.window:
+        outputs.check("out", options.out)
     task, policy = sources.policy(options.folder, options.method, options.seed, options.n_demos)
     mode = "human" if options.window else "rgb_array"
     if not options.window:

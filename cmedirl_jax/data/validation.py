@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax import checks
-from cmedirl_jax.envs import Env, HostEnv
+from cmedirl_jax.envs import Env, HostEnv, split_id
 from cmedirl_jax.types import Demonstrations, EnvSpec, Transition
 
 ABSENT = ("action", "reward")
@@ -35,7 +35,7 @@ def validate(demonstrations: Demonstrations, spec: EnvSpec | None = None) -> Non
     transition, truncated, episode, metadata = demonstrations
     if spec is not None:
         checks.env_spec(spec)
-    if spec is not None and _name(metadata.get("env")) != _name(spec.id):
+    if spec is not None and _bare(metadata.get("env")) != _bare(spec.id):
         raise ValueError(f"made for environment {metadata.get('env')!r}, not {spec.id!r}")
     arrays = {**transition._asdict(), "truncated": truncated, "episode": episode}
     arrays = {name: np.asarray(array) for name, array in arrays.items()}
@@ -48,9 +48,8 @@ def validate(demonstrations: Demonstrations, spec: EnvSpec | None = None) -> Non
         _validate_continuity(arrays)
 
 
-def _name(env: Any) -> Any:
-    """A task's name without the module that registers it."""
-    return env.rpartition(":")[2] if isinstance(env, str) else env
+def _bare(env: Any) -> Any:
+    return split_id(env)[1] if isinstance(env, str) else env
 
 
 def absent(demonstrations: Demonstrations) -> tuple[str, ...]:
@@ -102,7 +101,9 @@ def _validate_sizes(arrays: dict[str, np.ndarray], spec: EnvSpec) -> None:
 
 
 def _validate_bounds(arrays: dict[str, np.ndarray], spec: EnvSpec) -> None:
-    for name in {"action", "observation", "next_observation"} & arrays.keys():
+    for name in ("action", "observation", "next_observation"):
+        if name not in arrays:
+            continue
         of = name.removeprefix("next_")
         low, high = getattr(spec, f"{of}_low"), getattr(spec, f"{of}_high")
         outside = checks.outside(arrays[name], low, high)

@@ -8,7 +8,7 @@ from cmedirl_jax.envs.gymnasium_vector import to_gymnasium_vector
 from cmedirl_jax.envs.gymnax import from_gymnax
 from cmedirl_jax.envs.host import HostEnv, from_gymnasium
 from cmedirl_jax.envs.registration import GYMNASIUM_NAMESPACE
-from cmedirl_jax.envs.registry import ENVS, find, make, register
+from cmedirl_jax.envs.registry import ENVS, find, make, register, split_id
 from cmedirl_jax.envs.validation import check
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "from_gymnax",
     "make",
     "register",
+    "split_id",
     "to_gymnasium",
     "to_gymnasium_vector",
     "wrappers",

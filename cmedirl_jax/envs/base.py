@@ -44,6 +44,31 @@ class StepFn(Protocol):
         ...
 
 
+Bounds = tuple[np.ndarray, np.ndarray]
+"""Lower and upper bounds, `[n]` float32."""
+
+
+def spec_of(
+    id: str,
+    observation: Bounds,
+    action: Bounds,
+    max_episode_steps: int,
+    reward_threshold: float | None,
+) -> EnvSpec:
+    """The specification of a task with these bounds; `EnvSpec` describes the rest."""
+    return EnvSpec(
+        id=id,
+        observation_dim=len(observation[0]),
+        action_dim=len(action[0]),
+        observation_low=observation[0],
+        observation_high=observation[1],
+        action_low=action[0],
+        action_high=action[1],
+        max_episode_steps=max_episode_steps,
+        reward_threshold=reward_threshold,
+    )
+
+
 Reset = tuple[Any, jax.Array]
 """A first state, and its observation `[O]`."""
 

@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.envs.base import Env, Reset, Step, cast_like, fixed_starts
-from cmedirl_jax.types import EnvSpec
+from cmedirl_jax.envs.base import Env, Reset, Step, cast_like, fixed_starts, spec_of
 
 
 class BraxState(flax.struct.PyTreeNode):
@@ -52,16 +51,9 @@ def from_brax(
     if "first_obs" in state.info:
         raise ValueError(f"{name}: it resets by itself; give it without its AutoResetWrapper")
     size, actions = state.obs.shape[0], int(env.action_size)
-    spec = EnvSpec(
-        id=name,
-        observation_dim=size,
-        action_dim=actions,
-        observation_low=np.full(size, -np.inf, np.float32),
-        observation_high=np.full(size, np.inf, np.float32),
-        action_low=np.full(actions, -1.0, np.float32),
-        action_high=np.full(actions, 1.0, np.float32),
-        max_episode_steps=max_episode_steps,
-        reward_threshold=reward_threshold,
+    unbounded, unit = np.full(size, np.inf, np.float32), np.ones(actions, np.float32)
+    spec = spec_of(
+        name, (-unbounded, unbounded), (-unit, unit), max_episode_steps, reward_threshold
     )
     reset = functools.partial(_reset, env, actions)
     return Env(

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax.envs.base import Env, Reset, Step, cast_like, fixed_starts
+from cmedirl_jax.envs.base import Bounds, Env, Reset, Step, cast_like, fixed_starts, spec_of
 from cmedirl_jax.types import EnvSpec
 
 
@@ -34,25 +34,19 @@ def from_gymnax(
     """
     params = env.default_params if params is None else params
     name = env.name if id is None else id
-    observation_low, observation_high = _bounds(name, "observations", env.observation_space(params))
-    action_low, action_high = _bounds(name, "actions", env.action_space(params))
-    spec = EnvSpec(
-        id=name,
-        observation_dim=len(observation_low),
-        action_dim=len(action_low),
-        observation_low=observation_low,
-        observation_high=observation_high,
-        action_low=action_low,
-        action_high=action_high,
-        max_episode_steps=int(params.max_steps_in_episode),
-        reward_threshold=reward_threshold,
+    spec = spec_of(
+        name,
+        _bounds(name, "observations", env.observation_space(params)),
+        _bounds(name, "actions", env.action_space(params)),
+        int(params.max_steps_in_episode),
+        reward_threshold,
     )
     step = functools.partial(_step, env)
     reset = functools.partial(_reset, env, spec)
     return Env(spec, params, reset, step, fixed_starts(reset))
 
 
-def _bounds(name: str, what: str, space: Any) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(name: str, what: str, space: Any) -> Bounds:
     if not hasattr(space, "low"):
         raise ValueError(f"{name}: its {what} are {type(space).__name__}, not continuous")
     if len(space.shape) != 1:

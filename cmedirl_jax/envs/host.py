@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
 from cmedirl_jax import checks
+from cmedirl_jax.envs.base import Bounds, spec_of
 from cmedirl_jax.types import EnvSpec
 
 
@@ -133,11 +134,11 @@ def _spec(
     known, actions = env.spec, env.action_space
     if isinstance(actions, gymnasium.spaces.Discrete):
         raise ValueError(f"{name}: its actions are {actions}; DDPG's are continuous")
-    observation_low, observation_high = _bounds(name, "observations", env.observation_space)
-    action_low, action_high = _bounds(name, "actions", env.action_space)
+    observation = _bounds(name, "observations", env.observation_space)
+    action = _bounds(name, "actions", env.action_space)
     if not np.issubdtype(actions.dtype, np.floating):
         raise ValueError(f"{name}: its actions are {actions.dtype}; DDPG's are continuous")
-    if not (np.isfinite(action_low) & np.isfinite(action_high)).all():
+    if not np.isfinite(action).all():
         raise ValueError(
             f"{name}: its actions have no bounds; give wrappers that bound them, as "
             "gymnasium.wrappers.RescaleAction"
@@ -150,22 +151,12 @@ def _spec(
         )
     if reward_threshold is None and known is not None:
         reward_threshold = known.reward_threshold
-    spec = EnvSpec(
-        id=name,
-        observation_dim=len(observation_low),
-        action_dim=len(action_low),
-        observation_low=observation_low,
-        observation_high=observation_high,
-        action_low=action_low,
-        action_high=action_high,
-        max_episode_steps=max_episode_steps,
-        reward_threshold=reward_threshold,
-    )
+    spec = spec_of(name, observation, action, max_episode_steps, reward_threshold)
     checks.env_spec(spec)
     return spec
 
 
-def _bounds(name: str, what: str, space: gymnasium.Space) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(name: str, what: str, space: gymnasium.Space) -> Bounds:
     if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
         found = f"of shape {space.shape}" if isinstance(space, gymnasium.spaces.Box) else space
         remedy = ", as gymnasium.wrappers.FlattenObservation does" * (what == "observations")

@@ -33,6 +33,12 @@ def make(id: str) -> Env:
     return env
 
 
+def split_id(id: str) -> tuple[str, str]:
+    """The module that registers a task, "" for none, and the name that it registers."""
+    module, _, name = id.rpartition(":")
+    return module, name
+
+
 def find(id: str, *, asynchronous: bool = False) -> Env | HostEnv:
     """Make an environment of this library, or else Gymnasium's of that name.
 

@@ -98,8 +98,7 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool =
     Raises:
         UserError: naming the option, what is wrong and what would be right.
     """
-    check(config)
-    env = envs.find(config.env, asynchronous=config.asynchronous)
+    env = check(config)
     path, demos = config.demos, None
     if path is not None:
         demos = cluster.pool_from_writer(
@@ -160,8 +159,8 @@ def budget_of(config: StudyConfig, env: Env | HostEnv) -> Budget:
     )
 
 
-def check(config: StudyConfig) -> None:
-    """Refuse what can be refused before any work.
+def check(config: StudyConfig) -> Env | HostEnv:
+    """Refuse what can be refused before any work; the task.
 
     Raises:
         UserError: naming the option, what is wrong and what would be right.
@@ -171,7 +170,7 @@ def check(config: StudyConfig) -> None:
         if method not in METHODS:
             raise UserError(f"--methods: unknown method {method!r}; there are {', '.join(METHODS)}")
     try:
-        env = envs.find(config.env)
+        env = envs.find(config.env, asynchronous=config.asynchronous)
         if isinstance(env, Env):
             envs.check(env, steps=0)
     except (TypeError, ValueError) as error:
@@ -196,6 +195,7 @@ def check(config: StudyConfig) -> None:
     if config.demos is None:
         asked = cells.asked(config.methods, config.n_demos)
         _check_enough(asked, config.resolved_experts.trajectories)
+    return env
 
 
 def _check_host(config: StudyConfig, on_host: bool) -> None:

@@ -11,6 +11,7 @@ import importlib
 
 from cmedirl_jax.agents.ddpg import DDPGHParams
 from cmedirl_jax.agents.exploration import ExplorationSettings, OrnsteinUhlenbeckHParams
+from cmedirl_jax.envs import split_id
 from cmedirl_jax.irl import IRLHParams
 from cmedirl_jax.training.settings import Settings
 
@@ -56,7 +57,7 @@ def of(task: str) -> TaskSettings:
 
 def found(task: str) -> TaskSettings | None:
     """The same; None for a task without. Imports its module, which may add them."""
-    module, _, name = task.rpartition(":")
+    module, name = split_id(task)
     if module:
         with contextlib.suppress(ImportError):
             importlib.import_module(module)

@@ -100,14 +100,3 @@ def test_what_is_absent_must_be(absent, message):
     pool = demonstrations.from_trajectories([WHOLE], SPEC.id, metadata={"absent": absent})
     with pytest.raises(ValueError, match=message):
         demonstrations.validate(pool)
-
-
-def test_nothing_is_computed_for_tasks_that_cannot_be_set_to_an_observation():
-    short = WHOLE | {"observations": WHOLE["observations"][:2], "rewards": None}
-    pool = demonstrations.from_trajectories([short], SPEC.id)
-    elsewhere = pools.ENV._replace(state_at=None)
-    assert demonstrations.complete(pool, elsewhere) is pool
-    whole = demonstrations.complete(pool, pools.ENV)
-    assert np.isfinite(whole.transition.reward).all()
-    assert whole.metadata["computed"] == ["next_observation", "reward"]
-    assert demonstrations.complete(whole, pools.ENV) is whole

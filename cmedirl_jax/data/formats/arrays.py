@@ -13,12 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from cmedirl_jax.data.formats.base import Format, is_file, named
+from cmedirl_jax.data.formats.base import Format, damaged, is_file, named
 from cmedirl_jax.data.trajectories import from_trajectories
 from cmedirl_jax.io import npz
 from cmedirl_jax.types import Demonstrations, EnvSpec
-
-Trajectory = dict[str, Any]
 
 
 def names_in(source: Any) -> frozenset[str]:
@@ -48,8 +46,7 @@ def read_npz(path: str | Path, wanted: Sequence[str], optional: Sequence[str] = 
     except OSError:
         raise
     except Exception as error:
-        # A damaged archive raises many types of error in zipfile, zlib and numpy.
-        raise ValueError(f"it is damaged ({' '.join(str(error).split())})") from error
+        raise damaged(error) from error
 
 
 def cut(length: int, ends: np.ndarray) -> list[slice]:
@@ -163,8 +160,7 @@ def of_d4rl_file(source: Any, env: str | EnvSpec | None) -> Demonstrations:
             there: list[Any] = [(name, file.get(name)) for name in (*_D4RL, *_D4RL_OPTIONAL)]
             found = {name: array[()] for name, array in there if array is not None}
     except Exception as error:
-        # HDF5 raises many types of error for a damaged file.
-        raise ValueError(f"it is damaged ({' '.join(str(error).split())[:200]})") from error
+        raise damaged(error) from error
     return of_d4rl(found, env)
 
 

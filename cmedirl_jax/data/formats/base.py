@@ -24,14 +24,17 @@ class Format(NamedTuple):
             object in memory; raises nothing.
         read: see `Read`. Raises ValueError for a source that is damaged or another format's,
             OSError for one that cannot be read, ModuleNotFoundError where a package is missing.
-        write: `(path or id, demonstrations)`; None for a format that is only read.
+        writes: `(target) -> bool`: whether a target's name, a path or an id, is that of this
+            format; None for a format that is only read.
+        write: `(target, demonstrations, spec)`. Raises as `read`.
         package: the extra that it needs; None for none.
     """
 
     description: str
     recognises: Callable[[Any], bool]
     read: Read
-    write: Callable[[Any, Demonstrations], None] | None = None
+    writes: Callable[[str], bool] | None = None
+    write: Callable[[str, Demonstrations, EnvSpec], Any] | None = None
     package: str | None = None
 
 
@@ -41,6 +44,11 @@ def is_file(source: Any, *endings: str) -> bool:
         return False
     path = Path(source)
     return path.suffix.lower() in endings and path.is_file()
+
+
+def damaged(error: Exception) -> ValueError:
+    """The refusal of a file for which its reader raised something, which may be anything."""
+    return ValueError(f"it is damaged ({' '.join(str(error).split())[:200]})")
 
 
 def named(env: str | EnvSpec | None) -> str | EnvSpec:

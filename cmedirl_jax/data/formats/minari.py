@@ -9,9 +9,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from cmedirl_jax.data.formats.base import Format, named
+from cmedirl_jax.data.formats.base import Format, damaged, named
 from cmedirl_jax.data.trajectories import from_trajectories
 from cmedirl_jax.data.validation import absent
+from cmedirl_jax.envs import split_id
 from cmedirl_jax.types import Demonstrations, EnvSpec
 
 ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
@@ -62,8 +63,7 @@ def from_minari(source: str | Path, env: str | EnvSpec | None = None) -> Demonst
             f"Minari has no dataset {source} here; fetch it by: minari download {source}"
         ) from error
     except Exception as error:
-        # Its storages raise many types of error for damaged files.
-        raise ValueError(f"it is damaged ({' '.join(str(error).split())[:200]})") from error
+        raise damaged(error) from error
     known = dataset.storage.metadata
     kept: dict[str, Any] = {name: known[name] for name in _OF_DATASET if name in known}
     kept = {name: list(x) if isinstance(x, set | tuple) else x for name, x in kept.items()}
@@ -109,22 +109,22 @@ def to_minari(
     """Make a dataset of Minari's, in Minari's folder of datasets.
 
     Args:
-        demonstrations: the pool; it must have actions.
+        demonstrations: the pool; it must have actions and rewards.
         dataset_id: its id, `(namespace/)(name/)name-vN`.
         spec: the task's, whose bounds become the spaces'; default what the pool spans.
         **facts: further arguments of `minari.create_dataset_from_buffers`: author, ref_min_score
             and so on.
 
     Raises:
-        ValueError: for another form of id, one that is taken, or a pool without actions.
+        ValueError: for another form of id, one that is taken, or a pool without actions or rewards.
     """
     import minari  # type: ignore[import-not-found]
     from minari.data_collector.episode_buffer import EpisodeBuffer  # type: ignore[import-not-found]
 
     if not ID.fullmatch(str(dataset_id)):
         raise ValueError(f"{dataset_id}: Minari's ids are (namespace/)(name/)name-vN")
-    if "action" in absent(demonstrations):
-        raise ValueError("Minari's datasets have actions, this pool has none")
+    for name in absent(demonstrations):
+        raise ValueError(f"Minari's datasets have {name}s, this pool has none")
     metadata, seeds = demonstrations.metadata, demonstrations.metadata.get("seeds", [])
     buffers = [
         EpisodeBuffer(**_buffer(own), id=index, seed=seeds[index] if index < len(seeds) else None)
@@ -145,11 +145,11 @@ def to_minari(
 
 
 def _buffer(own: dict[str, np.ndarray]) -> dict[str, Any]:
-    """An episode as Minari's buffer takes it; rewards that are absent are zeros there."""
+    """An episode as Minari's buffer takes it."""
     return {
         "observations": np.concatenate([own["observation"], own["next_observation"][-1:]]),
         "actions": own["action"],
-        "rewards": np.nan_to_num(own["reward"]),
+        "rewards": own["reward"],
         "terminations": own["terminated"],
         "truncations": own["truncated"],
         "infos": {},
@@ -174,13 +174,15 @@ def _space(values: np.ndarray, spec: EnvSpec | None, name: str) -> gymnasium.spa
 
 def _gymnasiums(env: str) -> str | None:
     """The environment's name where Gymnasium knows it: Minari can then make it again."""
-    return env if env in gymnasium.registry else None
+    name = split_id(env)[1]
+    return name if name in gymnasium.registry else None
 
 
 MINARI = Format(
     "a dataset of Minari's, by its id or folder",
     recognises,
     from_minari,
-    lambda dataset_id, demonstrations: to_minari(demonstrations, dataset_id),
+    lambda target: bool(ID.fullmatch(target)),
+    lambda target, demonstrations, spec: to_minari(demonstrations, target, spec=spec),
     package="minari",
 )

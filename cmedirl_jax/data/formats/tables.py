@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from cmedirl_jax.data.formats.base import Format, is_file, named
+from cmedirl_jax.data.formats.base import Format, damaged, is_file, named
 from cmedirl_jax.data.trajectories import from_trajectories
 from cmedirl_jax.data.validation import absent
 from cmedirl_jax.io import atomic
@@ -26,6 +26,8 @@ from cmedirl_jax.types import Demonstrations, EnvSpec
 
 _NUMBERED = re.compile(r"(observation|action|next_observation)_(\d+)")
 _FLAGS = ("terminated", "truncated")
+ENDINGS = (".csv", ".parquet")
+"""Of the names of tables."""
 
 
 def of_table(source: Any, env: str | EnvSpec | None) -> Demonstrations:
@@ -38,8 +40,7 @@ def of_table(source: Any, env: str | EnvSpec | None) -> Demonstrations:
     except OSError:
         raise
     except Exception as error:
-        # polars and its engines raise many types of error for a damaged file.
-        raise ValueError(f"it is damaged ({' '.join(str(error).split())[:200]})") from error
+        raise damaged(error) from error
     return _of_columns({name: table[name].to_numpy() for name in table.columns}, named(env))
 
 
@@ -148,7 +149,7 @@ def write_template(path: str | Path, spec: EnvSpec) -> None:
 def _write(path: Path, columns: dict[str, Any]) -> None:
     import polars as pl
 
-    if path.suffix.lower() not in (".csv", ".parquet"):
+    if path.suffix.lower() not in ENDINGS:
         raise ValueError(f"{path}: give a name that ends in .csv or .parquet")
     table = pl.DataFrame(columns)
     with atomic.replacing(path) as partial:
@@ -170,7 +171,7 @@ def of_imitation_folder(source: Any, env: str | EnvSpec | None) -> Demonstration
     except OSError:
         raise
     except Exception as error:
-        raise ValueError(f"it is damaged ({' '.join(str(error).split())[:200]})") from error
+        raise damaged(error) from error
     missing = [name for name in ("obs", "acts", "terminal") if name not in table.columns]
     if missing:
         raise ValueError(f"it has no column {missing[0]!r}")
@@ -190,9 +191,10 @@ def of_imitation_folder(source: Any, env: str | EnvSpec | None) -> Demonstration
 
 TABLE = Format(
     "a CSV or Parquet file with a row for each step",
-    lambda source: is_file(source, ".csv", ".parquet"),
+    lambda source: is_file(source, *ENDINGS),
     of_table,
-    write_table,
+    lambda target: Path(target).suffix.lower() in ENDINGS,
+    lambda target, demonstrations, spec: write_table(target, demonstrations),
     package="cli",
 )
 IMITATION_FOLDER = Format(

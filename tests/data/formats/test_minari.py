@@ -1,0 +1,70 @@
+"""Minari's datasets: what they keep, and what they cannot hold."""
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+
+from cmedirl_jax.data import demonstrations
+from tests.support.formats import FACTS, SPEC, as_pool, episodes
+
+
+def test_a_dataset_of_minaris_keeps_its_seeds_and_metadata(tmp_path):
+    minari = pytest.importorskip("minari")
+    pool = as_pool(episodes())
+    pool = pool._replace(metadata=pool.metadata | {"seeds": [5, 6, 7]})
+    demonstrations.to_minari(pool, "test/kept-v3", spec=SPEC, **FACTS)
+    # Minari alone reads it.
+    dataset = minari.load_dataset("test/kept-v3")
+    assert (dataset.total_episodes, dataset.total_steps) == (3, 8)
+    assert dataset.env_spec.id == SPEC.id
+    again = demonstrations.from_minari("test/kept-v3")
+    assert again.metadata["seeds"] == [5, 6, 7]
+    assert again.metadata["author"] in ("somebody", ["somebody"])
+    assert again.metadata["ref_max_score"] == 90.0
+    assert json.dumps(again.metadata)
+    with pytest.raises(ValueError, match="already exist"):
+        demonstrations.to_minari(pool, "test/kept-v3", spec=SPEC, **FACTS)
+    with pytest.raises(ValueError, match="Minari's ids are"):
+        demonstrations.to_minari(pool, "no version", spec=SPEC)
+    with pytest.raises(FileNotFoundError, match=r"fetch it by: minari download test/absent-v0"):
+        demonstrations.read("test/absent-v0")
+
+
+def test_a_minari_dataset_of_an_environment_that_is_not_here(tmp_path):
+    minari = pytest.importorskip("minari")
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+
+    box = gymnasium.spaces.Box
+    trajectory = episodes([3])[0]
+    buffer = EpisodeBuffer(
+        id=0,
+        observations=trajectory["observations"],
+        actions=trajectory["actions"],
+        rewards=list(trajectory["rewards"]),
+        terminations=[False, False, True],
+        truncations=[False] * 3,
+    )
+    facts = {name: value for name, value in FACTS.items() if name != "eval_env"}
+    with pytest.warns(UserWarning, match="env"):
+        minari.create_dataset_from_buffers(
+            "test/foreign-v0",
+            [buffer],
+            observation_space=box(-2, 2, (2,), np.float64),
+            action_space=box(-1, 1, (1,), np.float64),
+            **facts,
+        )
+    with pytest.raises(ValueError, match="it does not name its task: give env"):
+        demonstrations.from_minari("test/foreign-v0")
+    pool = demonstrations.read("test/foreign-v0", env=SPEC)
+    assert pool.transition.terminated.tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("name", ["action", "reward"])
+def test_what_a_pool_lacks_is_not_made_up(name):
+    trajectories = episodes()
+    for each in trajectories:
+        each[f"{name}s"] = None
+    with pytest.raises(ValueError, match=f"Minari's datasets have {name}s, this pool has none"):
+        demonstrations.to_minari(as_pool(trajectories), "test/lacking-v0", spec=SPEC)
