@@ -1,18 +1,13 @@
 """This library's tasks as Gymnasium's."""
 
-import subprocess
-import sys
 import warnings
 
 import gymnasium
-import jax
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 from cmedirl_jax import envs
-from cmedirl_jax.envs import registration
-from tests.support import ROOT
 
 REGISTERED = ["cmedirl_jax/MountainCarContinuous-v0", "cmedirl_jax/Pendulum-v1"]
 
@@ -31,18 +26,6 @@ def test_gymnasiums_checker_finds_nothing_in_a_task_without_a_picture():
         envs.to_gymnasium(envs.make("PointMass-v0"), render_mode="rgb_array")
     with pytest.raises(ValueError, match="Pendulum-v1 has no picture 'ansi'"):
         envs.to_gymnasium(envs.make("Pendulum-v1"), render_mode="ansi")
-
-
-def test_gymnasium_finds_them_where_nothing_was_imported():
-    script = (
-        "import gymnasium\n"
-        "env = gymnasium.make('cmedirl_jax:cmedirl_jax/Pendulum-v1')\n"
-        "print(env.spec.id, env.reset(seed=0)[0].shape)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "cmedirl_jax/Pendulum-v1 (3,)\n"
 
 
 @pytest.mark.parametrize("name", REGISTERED)
@@ -72,17 +55,6 @@ def test_a_seed_decides_all_episodes_after_it():
         runs.append((first, env.reset()[0], env.reset()[0]))
     np.testing.assert_array_equal(runs[0], runs[1])
     assert len(np.unique(np.array(runs[0]), axis=0)) == 3
-
-
-def test_the_time_limit_is_that_of_make_or_of_the_parameters():
-    env = gymnasium.make("cmedirl_jax/Pendulum-v1", max_episode_steps=300)
-    env.reset(seed=0)
-    flags = [env.step(np.zeros(1, np.float32))[3] for _ in range(300)]
-    assert flags == [False] * 299 + [True]
-    task = envs.make("Pendulum-v1")
-    short = envs.to_gymnasium(task, task.default_params.replace(max_episode_steps=3))
-    short.reset(seed=0)
-    assert [short.step(np.zeros(1, np.float32))[3] for _ in range(3)] == [False, False, True]
 
 
 def test_a_frame_shows_the_state_and_the_torque(monkeypatch):
@@ -124,10 +96,3 @@ def test_a_task_goes_out_and_comes_back_in():
     back = envs.from_gymnasium(lambda: envs.to_gymnasium(task))
     for name, value in back.spec._asdict().items():
         np.testing.assert_array_equal(value, getattr(task.spec, name), err_msg=name)
-
-
-def test_registering_twice_changes_nothing():
-    before = [gymnasium.spec(name) for name in REGISTERED]
-    registration.register()
-    assert [gymnasium.spec(name) for name in REGISTERED] == before
-    assert jax.tree.leaves(before)
