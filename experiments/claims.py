@@ -23,6 +23,7 @@ otherwise.
 """
 
 import dataclasses
+import html
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,9 +34,10 @@ import tyro
 from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.report.base import Run, Verdicts
 from cmedirl_jax.runs.storage import outputs
 from experiments import pooled, verdicts
-from experiments.pooled import Pooled, Run
+from experiments.pooled import Pooled
 from experiments.verdicts import Claim
 
 
@@ -116,6 +118,31 @@ def page(runs: Sequence[Pooled], claims: Sequence[Claim]) -> str:
         lines += [] if claim.parts else [f"- {claim.why}"]
         lines.append("")
     return "\n".join(lines)
+
+
+def verdicts_on(run: Run) -> Verdicts:
+    """The verdicts on one run, for its report."""
+    runs = of_one_page([run])
+    judged = verdicts.judge(runs)
+    return Verdicts(page(runs, judged), section(judged))
+
+
+def section(claims: Sequence[Claim]) -> str:
+    """The verdicts as HTML."""
+    rows = []
+    for claim in claims:
+        kind = {"supported": "supported", "not supported": "not"}.get(claim.verdict, "other")
+        measured = [f"{part.outcome}: {part.measured}" for part in claim.parts] or [claim.why]
+        items = "".join(f"<li>{html.escape(line)}</li>" for line in measured)
+        rows.append(
+            f"<tr><td>{claim.name}</td><td>{html.escape(claim.text)}<details><summary>what was "
+            f'measured</summary><ul>{items}</ul></details></td><td class="{kind}"><b>'
+            f"{html.escape(claim.verdict)}</b></td></tr>"
+        )
+    return (
+        "<h2>The paper's claims</h2><table><tr><th></th><th>claim</th><th>verdict</th></tr>"
+        f"{''.join(rows)}</table>"
+    )
 
 
 if __name__ == "__main__":

@@ -23,9 +23,9 @@ from cmedirl_jax.runs import paired
 from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.report.summary import cell_label
 from cmedirl_jax.runs.storage import outputs
 from experiments import measures, pooled
-from experiments.evidence import said
 from experiments.measures import AREA, EPISODES, FINAL, STABLE, STEPS, speed
 from experiments.pooled import CellName, CellSeeds
 
@@ -88,7 +88,7 @@ def compare(
             rows.append(labels | measures.difference(measure, (cell, runs), (reference, runs)))
     left_out = [name for name in runs.cells if not any(name in pair for pair in pairs)]
     if left_out:
-        names = ", ".join(said(name) for name in left_out)
+        names = ", ".join(cell_label(*name) for name in left_out)
         say(f"Left out, since they never act or {against} has no one cell for them: {names}")
     adjusted = paired.holm(np.array([row["p_value"] for row in rows]))
     return pl.DataFrame([row | {"p_holm": p} for row, p in zip(rows, adjusted, strict=True)])
@@ -138,7 +138,7 @@ def shown(table: pl.DataFrame) -> Table:
             mean, low, high = (form(found[f"difference{end}"]) for end in ("", "_low", "_high"))
             row.append(f"{mean} \\[{low}, {high}]\np {found['p_holm']:.4f}, {found['equivalence']}")
         method, n_demos, against, other = group.select(cells).row(0)
-        printed.add_row(said((method, n_demos)), said((against, other)), *row)
+        printed.add_row(cell_label(method, n_demos), cell_label(against, other), *row)
     return printed
 
 

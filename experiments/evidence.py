@@ -7,6 +7,7 @@ import numpy as np
 
 from cmedirl_jax.runs import paired
 from cmedirl_jax.runs.paired import Difference
+from cmedirl_jax.runs.report.summary import cell_label
 from experiments import pooled
 from experiments.measures import STEPS, Measure, speed
 from experiments.pooled import CellName, Pooled
@@ -144,7 +145,7 @@ class Evidence:
             values = measure.of(cell, run)[mine]
             against = measure.of(reference, run)[others]
             clusters = pooled.clusters(cell, reference, mine, others)
-            label = f"{said(name)} against {said(other)}"
+            label = f"{cell_label(*name)} against {cell_label(*other)}"
             study = cell.study[mine]
             found = _comparison(label, measure, values, against, clusters, study, measure.span(run))
             diverged = max(cell.diverged.mean(), reference.diverged.mean())
@@ -162,7 +163,7 @@ class Evidence:
             cell = run.cells[name]
             clusters = cell.expert if (cell.expert >= 0).all() else None
             values = measure.of(cell, run)
-            label = f"{said(name)} against its experts"
+            label = f"{cell_label(*name)} against its experts"
             found = _comparison(
                 label, measure, values, cell.expert_return, clusters, cell.study, measure.span(run)
             )
@@ -191,9 +192,3 @@ def _comparison(
 
     studies = tuple(among(study == one) for one in np.unique(study))
     return Comparison(label, measure, among(np.ones(values.size, bool)), studies)
-
-
-def said(name: CellName) -> str:
-    """A cell's name as the page calls it."""
-    method, n_demos = name
-    return f"{method} (N_T {n_demos})" if n_demos else method

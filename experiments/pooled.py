@@ -9,9 +9,10 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from cmedirl_jax import envs
 from cmedirl_jax.runs import statistics
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.lifetime import lifetime
+from cmedirl_jax.runs.report.base import Run
 from cmedirl_jax.runs.statistics import SeedStatistics
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import tables
@@ -25,15 +26,6 @@ BUDGET = (
 )
 """The options that say how long seeds live and when they are evaluated."""
 _MAY_DIFFER = {"seed", "group", *run_folder.NOT_COMPARED} - {"seeds"}
-
-
-class Run(NamedTuple):
-    """A run on disk: its folder, its configuration, its task's threshold, its tables by name."""
-
-    folder: Path
-    config: dict[str, Any]
-    threshold: float
-    tables: dict[str, pl.DataFrame]
 
 
 class CellSeeds(NamedTuple):
@@ -80,32 +72,6 @@ class Pooled(NamedTuple):
     config: dict[str, Any]
     steps: int
     episodes: int | None
-
-
-class Lifetime(NamedTuple):
-    """What ends the seeds of a run.
-
-    Attributes:
-        steps: the last environment step that a seed can reach.
-        episodes: after which every seed ends; None where steps end it.
-        mixed: some may end by steps and others by episodes, so that they are not watched for as
-            long in either.
-    """
-
-    steps: int
-    episodes: int | None
-    mixed: bool
-
-
-def lifetime(config: dict[str, Any]) -> Lifetime:
-    """What ends the seeds of a run, by its configuration."""
-    episodes, steps = config["max_episodes"], config["max_steps"]
-    if episodes is None:
-        return Lifetime(int(steps), None, False)
-    longest = episodes * envs.find(config["env"]).spec.max_episode_steps
-    if steps is None or longest <= steps:
-        return Lifetime(int(longest), episodes, False)
-    return Lifetime(int(steps), None, True)
 
 
 def load(folder: Path) -> Run:

@@ -7,7 +7,7 @@ from cmedirl_jax.agents.exploration import ExplorationSettings
 from cmedirl_jax.agents.hot_start import HotStartHParams
 from cmedirl_jax.irl import IRLHParams
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
-from cmedirl_jax.runs.config import ExpertSettings, StudyConfig
+from cmedirl_jax.runs.config import ExpertSettings, StudyConfig, of_task
 from cmedirl_jax.tabular.imitation import TabularSettings
 from cmedirl_jax.training import tasks
 from cmedirl_jax.training.schedules import RewardSchedule, Schedule
@@ -63,18 +63,15 @@ PRESETS: dict[str, StudyConfig] = {
 def preset(name: str, grid: str = "main", env: str = CAR) -> StudyConfig:
     """The configuration of a preset, on one of the two grids; `tuned` for an unknown name.
 
-    On another task its experts have the settings that work there, see `training.tasks`; under
-    `tuned` its learners too, for as many steps. On a task without, experts train as learners do.
+    The task's experts have the settings that work there, see `config.of_task`; under `tuned` its
+    learners too, for as many steps.
     """
-    config = PRESETS.get(name, PRESETS["tuned"])
-    if env != CAR:
-        found = tasks.found(env)
-        task = found or tasks.TaskSettings()
-        own = task.experts if found or config.preset == "paper" else None
+    config, task = PRESETS.get(name, PRESETS["tuned"]), of_task(env)
+    if config.preset == "tuned":
+        config = task
+    else:
+        own = tasks.of(env).experts if config.preset == "paper" else task.experts.settings
         experts = dataclasses.replace(config.experts, settings=own)
-        if config.preset == "tuned":
-            experts = dataclasses.replace(experts, steps=task.expert_steps)
-            config = dataclasses.replace(config, settings=task.settings, max_steps=task.steps)
         config = dataclasses.replace(config, env=env, experts=experts)
     if grid != "full":
         return config

@@ -11,8 +11,9 @@ import polars as pl
 
 from cmedirl_jax.runs import intervals
 from cmedirl_jax.runs.intervals import Interval
+from cmedirl_jax.runs.report.summary import cell_label
 from cmedirl_jax.training.methods import PAPER_METHODS
-from experiments.evidence import Comparison, Evidence, Outcome, Sign, said
+from experiments.evidence import Comparison, Evidence, Outcome, Sign
 from experiments.measures import DIPS, FINAL, STABLE, STEPS
 from experiments.pooled import CellName, Pooled
 
@@ -98,17 +99,17 @@ def _near_expert(evidence: Evidence, name: CellName) -> Part | None:
         return None
     experts = _experts(run)
     if not set(run.cells[name].pair.tolist()) <= experts.keys():
-        return Part(f"{said(name)}: no table says what its seeds' experts return", "unclear")
+        return Part(f"{cell_label(*name)}: no table says what its seeds' experts return", "unclear")
     behind = _behind_experts(run, name, experts, episodes=120)
     if behind is None:
-        return Part(f"{said(name)}: some seeds live no 120 episodes here", "unclear")
+        return Part(f"{cell_label(*name)}: some seeds live no 120 episodes here", "unclear")
     outcome: Outcome = "unclear"
     if behind.low >= -NEAR:
         outcome = "yes"
     elif behind.high < -NEAR:
         outcome = "no"
     measured = f"return minus the expert's at 120 episodes: {_shown(behind)}"
-    return Part(f"{said(name)}, {measured}", outcome)
+    return Part(f"{cell_label(*name)}, {measured}", outcome)
 
 
 def _experts(run: Pooled) -> dict[int, tuple[int, float]]:
@@ -182,7 +183,7 @@ def _converges(evidence: Evidence, name: CellName, episodes: int) -> Part | None
         return None
     found = run.cells[name].statistics.convergence_episode
     if run.episodes is None and not np.isfinite(found).all():
-        return Part(f"{said(name)}: seeds that failed lived fewer episodes", "unclear")
+        return Part(f"{cell_label(*name)}: seeds that failed lived fewer episodes", "unclear")
     median = intervals.median(found)
     low, high = episodes / FACTOR, episodes * FACTOR
     outcome: Outcome = "unclear"
@@ -190,7 +191,7 @@ def _converges(evidence: Evidence, name: CellName, episodes: int) -> Part | None
         outcome = "yes"
     elif median.high < low or median.low > high:
         outcome = "no"
-    measured = f"{said(name)}, median episodes until convergence: {_shown(median, '{:.0f}')}"
+    measured = f"{cell_label(*name)}, median episodes until convergence: {_shown(median, '{:.0f}')}"
     return Part(f"{measured}; claimed {low:.0f} to {high:.0f}", outcome)
 
 

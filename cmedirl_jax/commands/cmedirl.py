@@ -4,12 +4,12 @@ import dataclasses
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from cmedirl_jax import ranges
-from cmedirl_jax.commands import convert, evaluate, inspect, record, template, watch
+from cmedirl_jax.commands import convert, evaluate, inspect, record, template, train, watch
 from cmedirl_jax.runs.console import ending
 from cmedirl_jax.runs.errors import UserError
 
@@ -25,14 +25,9 @@ Demos = (
 class DemosOptions:
     """Demonstrations: look at them, convert them, record some, or begin with a template."""
 
-    what: tyro.conf.OmitSubcommandPrefixes[Demos]
+    what: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Demos]]
 
 
-Command = (
-    Annotated[DemosOptions, tyro.conf.subcommand("demos")]
-    | Annotated[evaluate.Options, tyro.conf.subcommand("evaluate", description=evaluate.__doc__)]
-    | Annotated[watch.Options, tyro.conf.subcommand("watch", description=watch.__doc__)]
-)
 _RUNS = {
     inspect.Options: inspect.run,
     convert.Options: convert.run,
@@ -46,15 +41,34 @@ _RUNS = {
 @ending.in_a_line("cmedirl")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
     # A task of the user's own, MODULE:NAME, may lie in the current folder, as with `python -m`.
     sys.path.insert(0, os.getcwd())
     chosen = tyro.cli(
-        tyro.conf.OmitArgPrefixes[Command],  # type: ignore[valid-type]
+        _commands(arguments),
         prog="cmedirl",
         description=__doc__,
-        args=None if arguments is None else list(arguments),
+        args=arguments,
     )
+    if isinstance(chosen, train.Options):
+        # A run checks its own numbers, whose ranges may depend on each other.
+        return train.run(chosen, arguments)
     options = chosen.what if isinstance(chosen, DemosOptions) else chosen
     for name, wrong in ranges.out_of_range(options):
         raise UserError(f"--{name.replace('_', '-')}: {wrong}")
     return _RUNS[type(options)](options)
+
+
+def _commands(arguments: Sequence[str]) -> Any:
+    """The union of the commands' options; some defaults depend on the arguments."""
+    of_train = tyro.conf.subcommand(
+        "train", default=train.default(arguments), description=train.__doc__
+    )
+    of_evaluate = tyro.conf.subcommand("evaluate", description=evaluate.__doc__)
+    of_watch = tyro.conf.subcommand("watch", description=watch.__doc__)
+    return (
+        Annotated[train.Options, of_train]
+        | Annotated[evaluate.Options, of_evaluate]
+        | Annotated[watch.Options, of_watch]
+        | Annotated[DemosOptions, tyro.conf.subcommand("demos")]
+    )

@@ -31,9 +31,8 @@ class Options(sources.PolicyOptions):
 
 def run(options: Options) -> int:
     """Run the command; returns its exit code."""
-    name, policy = sources.policy(options.folder, options.method, options.seed, options.n_demos)
-    env = sources.task(name)
-    found = rollouts(env, policy, options.starts)
+    policy = sources.policy(options.folder, options.method, options.seed, options.n_demos)
+    found = rollouts(sources.task(policy.task), policy.act, options.starts)
     screen.say(
         screen.console(),
         f"return {np.mean(found.episode_return):.4g} ± {np.std(found.episode_return):.2g} over "

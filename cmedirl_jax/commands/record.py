@@ -33,7 +33,7 @@ class Options:
     Attributes:
         out: A file that ends in .npz, .csv or .parquet, or the id of a new dataset of Minari's.
         run: A run's folder, whose policy demonstrates.
-        method: Of the run.
+        method: Of the run, where it has several.
         seed: Which of its learners.
         n_demos: Demonstrations of the learner, where the run has several numbers of them.
         env: The task, where a function demonstrates.
@@ -44,7 +44,7 @@ class Options:
 
     out: Annotated[str, tyro.conf.Positional]
     run: str | None = None
-    method: str = "hs-me-ddpg"
+    method: str | None = None
     seed: Count = 0
     n_demos: Size | None = None
     env: str | None = None
@@ -75,10 +75,9 @@ def _demonstrator(options: Options) -> tuple[str, Callable[[np.ndarray], Any], s
     if (options.run is None) == (options.policy is None):
         raise UserError("give either --run, or --policy and --env")
     if options.run is not None:
-        name, policy = sources.policy(
-            Path(options.run), options.method, options.seed, options.n_demos
-        )
-        return name, jax.jit(policy), f"{options.method}, seed {options.seed}, of {options.run}"
+        policy = sources.policy(Path(options.run), options.method, options.seed, options.n_demos)
+        source = f"{policy.method}, seed {options.seed}, of {options.run}"
+        return policy.task, jax.jit(policy.act), source
     if options.env is None:
         raise UserError("--env: name the task that --policy acts in")
     assert options.policy is not None

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import tyro
@@ -24,28 +24,43 @@ class PolicyOptions:
 
     Attributes:
         folder: A run's folder.
-        method: Which method's policy.
+        method: Which method's policy, where the run has several.
         seed: Of which learner.
         n_demos: Demonstrations of the learner, where the run has several numbers of them.
     """
 
     folder: Annotated[Path, tyro.conf.Positional]
-    method: str = "hs-me-ddpg"
+    method: str | None = None
     seed: Count = 0
     n_demos: Size | None = None
 
 
-def policy(
-    run: Path, method: str, seed: int, n_demos: int | None
-) -> tuple[str, Callable[[Any], jax.Array]]:
-    """The name of a run's task, and the best policy of one of its learners.
+class Policy(NamedTuple):
+    """A policy that was learned.
+
+    Attributes:
+        task: the name of its task.
+        method: that learned it.
+        act: `observation [..., O] -> action [..., A]`, not compiled.
+    """
+
+    task: str
+    method: str
+    act: Callable[[Any], jax.Array]
+
+
+def policy(run: Path, method: str | None, seed: int, n_demos: int | None) -> Policy:
+    """The best policy of one of a run's learners; its only method's if none is named.
 
     Raises:
         UserError: if there is no such run or policy, or there are several.
     """
-    task = run_folder.read(run)["config"]["env"]
+    config = run_folder.read(run)["config"]
+    if method is None and len(config["methods"]) > 1:
+        raise UserError(f"--method: {run} has several: {', '.join(config['methods'])}")
+    chosen: str = method or config["methods"][0]
     try:
-        return task, load_policy(run, method, seed, n_demos)
+        return Policy(config["env"], chosen, load_policy(run, chosen, seed, n_demos))
     except ValueError as error:
         raise UserError(" ".join(str(error).split())) from error
 

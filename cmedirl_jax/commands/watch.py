@@ -48,12 +48,12 @@ def run(options: Options) -> int:
     """Run the command; returns its exit code."""
     if not options.window:
         outputs.check("out", options.out)
-    task, policy = sources.policy(options.folder, options.method, options.seed, options.n_demos)
+    policy = sources.policy(options.folder, options.method, options.seed, options.n_demos)
     mode = "human" if options.window else "rgb_array"
     if not options.window:
         # Frames are drawn in memory: no screen is looked for.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    frames = of_episode(jax.jit(policy), task, options.reset_seed, options.every, mode)
+    frames = of_episode(jax.jit(policy.act), policy.task, options.reset_seed, options.every, mode)
     if not options.window:
         outputs.write(options.out, gif(frames, options.width))
         screen.say(screen.console(), f"{options.out}: {len(frames)} frames")

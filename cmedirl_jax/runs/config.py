@@ -10,6 +10,7 @@ import tyro
 from cmedirl_jax.data.formats.reading import Actions
 from cmedirl_jax.ranges import Count, NotNegative, Range, Size
 from cmedirl_jax.runs.cluster.base import ClusterOptions
+from cmedirl_jax.training import tasks
 from cmedirl_jax.training.methods import PAPER_METHODS
 from cmedirl_jax.training.settings import Settings
 
@@ -56,59 +57,45 @@ class Experts(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class StudyConfig:
+class RunConfig:
     """A run: methods x numbers of demonstrations x seeds, a learner's budget, its settings.
 
     Attributes:
-        preset: tuned: the setting that works; paper: the paper's letter; smoke: ends within a
-            minute.
-        grid: main: one number of demonstrations; full: the paper's sweep over N_T, and under tuned
-            20,000 steps for each learner.
-        methods: Which methods to train.
-        n_demos: Demonstrated trajectories N_T per learner; several make Figures 4 and 5. By
-            default also all that the file of --demos holds, where it holds fewer.
-        seeds: Independent learners per cell.
-        seed: Seed of the whole study.
-        max_steps: Environment steps per learner.
-        max_episodes: Episodes per learner; with max-steps, whichever comes first.
-        evaluate_every: Environment steps between noise-free evaluations.
-        evaluation_starts: Start states per evaluation, the same for every seed and method; they
-            weigh as the task draws them.
-        evaluate_every_episodes: Also evaluate each learner whenever it has lived this many more
-            episodes (the paper: 100).
-        evaluation_starts_episodes: Start states of the evaluations by episodes.
-        out: Folder of the results; default results/PRESET, or results/PRESET-full.
-        expert: Who demonstrates: each learner has an expert of its own (they share where there are
-            fewer), or all share the best one that solved the task, the median one, or all of them
-            alike.
+        env: The task, by its name: one of this library's, or else Gymnasium's, MODULE:NAME too.
         demos: Demonstrations to learn from: a file or folder of any format (docs/data.md), or the
-            id of a dataset of Minari's; no experts are trained, and their options are not read.
+            id of a dataset of Minari's; default: those of experts that are trained first.
         demos_format: Its format, where it does not look like what it is.
         demos_actions: What happens to demonstrated actions out of bounds.
         check_demos: What is asked of that file. dynamics: that each step is the task's own, where
             the task can be set to an observation; spec: the task's name and bounds, and that steps
             follow each other, for tasks that draw random numbers; none: the task's sizes, for
             noisy demonstrations or those of another task.
-        env: The task, by its name: one of this library's, or else Gymnasium's, MODULE:NAME too;
-            under tuned it brings settings of its own, where it has some.
+        methods: Which methods to train.
+        n_demos: Demonstrated trajectories N_T per learner; several make Figures 4 and 5. By
+            default also all that --demos holds, where it holds fewer.
+        seeds: Independent learners per cell.
+        seed: Seed of the whole run.
+        max_steps: Environment steps per learner.
+        max_episodes: Episodes per learner; with max-steps, whichever comes first.
+        evaluate_every: Environment steps between noise-free evaluations.
+        evaluation_starts: Start states per evaluation, the same for every seed and method; they
+            weigh as the task draws them.
+        out: Folder of the results.
         asynchronous: Step each learner's copy of a task of Gymnasium's in a process of its own,
             for slow tasks.
         devices: CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU.
             With several processes, of each of them.
         group: Seeds that a device steps together; default: what is fastest for the networks' width.
-        distributed: Share the run with the other processes of the cluster that JAX detects
-            (docs/scaling.md).
-        coordinator: Share the run with other processes: HOST:PORT of process 0, the same for all of
-            them.
-        processes: With coordinator: how many processes there are.
-        process_id: With coordinator: which of them this is, from 0; process 0 alone writes results.
         checkpoint_every: Seconds from one checkpoint of the training to the next; 0: one after
             every chunk.
     """
 
-    preset: Literal["tuned", "paper", "smoke"] = "tuned"
-    grid: Literal["main", "full"] = "main"
-    methods: tuple[str, ...] = PAPER_METHODS
+    env: str = "MountainCarContinuous-v0"
+    demos: Path | None = None
+    demos_format: str | None = None
+    demos_actions: Actions = "refuse"
+    check_demos: DemosCheck = "dynamics"
+    methods: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--method",))] = PAPER_METHODS
     n_demos: tuple[Size, ...] = (200,)
     seeds: Size = 100
     seed: Annotated[int, Range(0, 2**32 - 1, "between 0 and 2^32 - 1")] = 0
@@ -116,25 +103,48 @@ class StudyConfig:
     max_episodes: Size | None = None
     evaluate_every: Size = 250
     evaluation_starts: Size = 10
-    evaluate_every_episodes: Size | None = None
-    evaluation_starts_episodes: Size = 100
     out: Path | None = None
-    expert: Expert = "each"
-    demos: Path | None = None
-    demos_format: str | None = None
-    demos_actions: Actions = "refuse"
-    check_demos: DemosCheck = "dynamics"
-    env: str = "MountainCarContinuous-v0"
     asynchronous: bool = False
     devices: Size | None = None
     group: Size | None = None
+    checkpoint_every: NotNegative = 60.0
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyConfig(RunConfig):
+    """A study: a run with its experts, its evaluations by episodes and its processes.
+
+    Attributes:
+        preset: tuned: the setting that works; paper: the paper's letter; smoke: ends within a
+            minute. Under tuned a task brings settings of its own, where it has some.
+        grid: main: one number of demonstrations; full: the paper's sweep over N_T, and under tuned
+            20,000 steps for each learner.
+        evaluate_every_episodes: Also evaluate each learner whenever it has lived this many more
+            episodes (the paper: 100).
+        evaluation_starts_episodes: Start states of the evaluations by episodes.
+        expert: Who demonstrates: each learner has an expert of its own (they share where there are
+            fewer), or all share the best one that solved the task, the median one, or all of them
+            alike.
+        experts: How they are made.
+        distributed: Share the run with the other processes of the cluster that JAX detects
+            (docs/scaling.md).
+        coordinator: Share the run with other processes: HOST:PORT of process 0, the same for all of
+            them.
+        processes: With coordinator: how many processes there are.
+        process_id: With coordinator: which of them this is, from 0; process 0 alone writes results.
+    """
+
+    preset: Literal["tuned", "paper", "smoke"] = "tuned"
+    grid: Literal["main", "full"] = "main"
+    evaluate_every_episodes: Size | None = None
+    evaluation_starts_episodes: Size = 100
+    expert: Expert = "each"
+    experts: ExpertSettings = ExpertSettings()
     distributed: bool = False
     coordinator: str | None = None
     processes: Size | None = None
     process_id: Count | None = None
-    checkpoint_every: NotNegative = 60.0
-    experts: ExpertSettings = ExpertSettings()
-    settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
 
     @property
     def resolved_experts(self) -> Experts:
@@ -160,3 +170,14 @@ class StudyConfig:
     def cluster(self) -> ClusterOptions:
         """Which processes share the run."""
         return ClusterOptions(self.distributed, self.coordinator, self.processes, self.process_id)
+
+
+def of_task(env: str) -> StudyConfig:
+    """The configuration of a task: its settings and budget, see `training.tasks`.
+
+    A task without settings of its own has the car's; its experts train as its learners do.
+    """
+    found = tasks.found(env)
+    task = found or tasks.TaskSettings()
+    experts = ExpertSettings(steps=task.expert_steps, settings=task.experts if found else None)
+    return StudyConfig(env=env, max_steps=task.steps, experts=experts, settings=task.settings)

@@ -43,6 +43,7 @@ _BALANCE = Settings(
 )
 
 TASKS: dict[str, TaskSettings] = {
+    "MountainCarContinuous-v0": TaskSettings(),
     "InvertedPendulum-v5": TaskSettings(_BALANCE, _BALANCE, steps=10_000, expert_steps=15_000),
     "Pendulum-v1": TaskSettings(_LARGER_REWARD, steps=10_000, expert_steps=10_000),
     "PointMass-v0": TaskSettings(_LARGER_REWARD, steps=10_000, expert_steps=10_000),

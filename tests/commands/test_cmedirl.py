@@ -7,7 +7,10 @@ import pytest
 
 from cmedirl_jax.commands import cmedirl, entry
 
-COMMANDS = ("demos inspect", "demos convert", "demos record", "demos template", "evaluate", "watch")
+COMMANDS = (
+    *("demos inspect", "demos convert", "demos record", "demos template"),
+    *("train", "evaluate", "watch"),
+)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -43,6 +46,10 @@ def test_the_help_names_every_command(capsys):
         ("demos template a.txt --env Pendulum-v1", "a.txt: give a name that ends in .csv or"),
         ("evaluate nowhere", "nowhere: holds no run"),
         ("evaluate x --starts 0", "--starts: must be at least 1, got 0"),
+        ("train --method ppo", "--methods: unknown method 'ppo'; there are ddpg, hs-ddpg,"),
+        ("train --env No-v0", "--env: unknown environment 'No-v0'; there are: "),
+        ("train --demos none.csv", "--demos: there is no file none.csv, nor a dataset"),
+        ("train --agent.tau 7", "--agent.tau: must be above 0 and at most 1, got 7.0"),
     ],
 )
 def test_a_mistake_is_a_line_and_code_2(arguments, line, tmp_path, monkeypatch, capsys):

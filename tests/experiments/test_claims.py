@@ -3,6 +3,7 @@ import pytest
 from cmedirl_jax.runs.errors import UserError
 from experiments import claims
 from experiments.presets import PRESETS
+from experiments.verdicts import Claim, Part
 from tests.support.curves import SEEDS, save, write_config
 
 
@@ -36,6 +37,18 @@ def test_runs_of_other_settings_are_not_judged_together(folder, tmp_path):
     save(other, "ddpg", 0, [[0, 20, 95]] * SEEDS)
     with pytest.raises(UserError, match=r"its \S+ is not that of"):
         claims.of_folders([folder, other])
+
+
+def test_the_section_of_a_report_has_every_verdict_and_its_evidence():
+    judged = [
+        Claim("C1", "Methods & more", (Part("a < b", "yes"),)),
+        Claim("C2", "Others", (Part("c", "no"),)),
+        Claim("C10", "Proofs", (), "none is given"),
+    ]
+    text = claims.section(judged)
+    for line in ("Methods &amp; more", "yes: a &lt; b", "not supported", "none is given"):
+        assert line in text
+    assert text.count("<tr>") == 4
 
 
 @pytest.mark.parametrize(

@@ -17,11 +17,12 @@ from cmedirl_jax.runs import load_policy, load_reward, run, start, train, valida
 from cmedirl_jax.runs.cells import experts
 from cmedirl_jax.runs.cluster.base import ALONE
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.report import figures
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import tables
 from cmedirl_jax.training import evaluation
 from cmedirl_jax.training.methods import METHODS, PAPER_METHODS
-from experiments import figures, report, run_grid
+from experiments import report, run_grid
 from tests.support import ROOT, pools
 
 SMOKE = ("--preset", "smoke")

@@ -1,6 +1,7 @@
 import polars as pl
 import pytest
 
+from cmedirl_jax.runs import command
 from experiments import variants
 from experiments.variants import VARIANTS, Variant
 from tests.support import curves
@@ -49,14 +50,14 @@ def test_a_variant_brings_its_base():
 @pytest.mark.parametrize("variant", [one for one in VARIANTS if one.base], ids=lambda one: one.name)
 def test_the_options_of_a_variant_are_run_grids(variant, monkeypatch):
     parsed = []
-    monkeypatch.setattr(
-        variants.run_grid, "work", lambda config, _: parsed.append(config.settings) or 3
-    )
+
+    def ending_with(code):
+        return lambda _, config, *args, **options: parsed.append(config.settings) or code
+
+    monkeypatch.setattr(command, "work", ending_with(3))
     code = variants.main(["--demos", "pool.npz", "--only", variant.name])
     assert code == 3
-    monkeypatch.setattr(
-        variants.run_grid, "work", lambda config, _: parsed.append(config.settings) or 0
-    )
+    monkeypatch.setattr(command, "work", ending_with(0))
     monkeypatch.setattr(variants, "compare", lambda *_: pl.DataFrame())
     monkeypatch.setattr(variants, "shown", lambda table: "")
     assert variants.main(["--demos", "pool.npz", "--only", variant.name]) == 0

@@ -9,8 +9,8 @@ import polars as pl
 from cmedirl_jax.runs import drawing, intervals, statistics
 from cmedirl_jax.runs.console import streams
 from cmedirl_jax.runs.drawing import Axes, Figure
-from experiments import curves, distributions
-from experiments.curves import Over
+from cmedirl_jax.runs.report import curves, distributions
+from cmedirl_jax.runs.report.curves import Over
 
 
 def draw(

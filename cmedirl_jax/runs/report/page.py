@@ -2,16 +2,15 @@
 
 import base64
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 
+from cmedirl_jax.runs.report.summary import cell_label
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.training.methods import METHODS
-from experiments.evidence import said
-from experiments.verdicts import Claim
 
 CAPTIONS = {
     "figure3": "Figure 3: average return during training.",
@@ -59,20 +58,21 @@ _EPISODES = ("convergence_episode_median", "episodes to solve, median", "{:,.0f}
 def page(
     config: Mapping[str, Any],
     summary: pl.DataFrame,
-    claims: Sequence[Claim],
     figures: Mapping[str, Path],
     versions: Mapping[str, str],
+    *,
     by_episodes: bool = False,
+    verdicts: str = "",
 ) -> str:
     """The page.
 
     Args:
         config: the run's configuration.
         summary: a row for each cell.
-        claims: the verdicts; empty where there are none.
         figures: PNG files by their names in `CAPTIONS`; those that are gone are left out.
         versions: of the packages that made the run.
         by_episodes: whether all seeds end at one episode, rather than at one step.
+        verdicts: HTML that stands before the results.
     """
     title = f"{config['env']}, {config['preset']}"
     budget = f"{config['max_steps']:,} environment steps" if config["max_steps"] else ""
@@ -82,7 +82,7 @@ def page(
         f"<h1>{_text(title)}</h1>",
         f"<p>{config['seeds']} seeds of each row, {budget} each; study seed {config['seed']}; "
         f"demonstrators: {_text(config['expert'])}. Brackets are 95% intervals.</p>",
-        _verdicts(claims),
+        verdicts,
         "<h2>Results</h2>",
         _results(summary, by_episodes),
         *(_figure(name, figures[name]) for name in CAPTIONS if name in figures),
@@ -101,25 +101,6 @@ def _text(value: object) -> str:
     return html.escape(str(value))
 
 
-def _verdicts(claims: Sequence[Claim]) -> str:
-    if not claims:
-        return ""
-    rows = []
-    for claim in claims:
-        kind = {"supported": "supported", "not supported": "not"}.get(claim.verdict, "other")
-        measured = [f"{part.outcome}: {part.measured}" for part in claim.parts] or [claim.why]
-        items = "".join(f"<li>{_text(line)}</li>" for line in measured)
-        rows.append(
-            f"<tr><td>{claim.name}</td><td>{_text(claim.text)}<details><summary>what was measured"
-            f'</summary><ul>{items}</ul></details></td><td class="{kind}"><b>'
-            f"{_text(claim.verdict)}</b></td></tr>"
-        )
-    return (
-        "<h2>The paper's claims</h2><table><tr><th></th><th>claim</th><th>verdict</th></tr>"
-        f"{''.join(rows)}</table>"
-    )
-
-
 def _results(summary: pl.DataFrame, by_episodes: bool) -> str:
     columns = [
         _EPISODES if by_episodes and name == "convergence_env_step_median" else (name, label, form)
@@ -135,7 +116,7 @@ def _results(summary: pl.DataFrame, by_episodes: bool) -> str:
     rows = ["<tr>" + "".join(f"<th>{_text(head)}</th>" for head in heads) + "</tr>"]
     for row in summary.iter_rows(named=True):
         label = METHODS[row["method"]].label if row["method"] in METHODS else None
-        name = said((row["method"], row["n_demos"]))
+        name = cell_label(row["method"], row["n_demos"])
         cells = [
             f'<td class="name">{_text(name)}'
             + (f"<small>{_text(label)}</small>" if label else "")

@@ -7,8 +7,8 @@ import polars as pl
 
 from cmedirl_jax.runs import intervals, statistics
 from cmedirl_jax.runs.drawing import Axes, Figure
+from cmedirl_jax.runs.report import curves
 from cmedirl_jax.runs.statistics import SeedStatistics
-from experiments import curves
 
 
 def survival(found: dict[str, SeedStatistics], last: float, by_episodes: bool) -> Figure:

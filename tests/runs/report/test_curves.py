@@ -1,7 +1,7 @@
 import polars as pl
 
+from cmedirl_jax.runs.report import curves
 from cmedirl_jax.training.methods import METHODS, PAPER_METHODS
-from experiments import curves
 
 
 def test_every_method_has_one_line_in_all_figures_and_no_other_has_it():

@@ -4,17 +4,12 @@ import polars as pl
 import pytest
 
 from cmedirl_jax.runs import statistics, validation
-from experiments import page
-from experiments.presets import PRESETS
-from experiments.verdicts import Claim, Part
+from cmedirl_jax.runs.config import StudyConfig
+from cmedirl_jax.runs.report import page
 from tests.support.cells import seeds_table
 
-CONFIG = validation.describe(PRESETS["smoke"])
-CLAIMS = [
-    Claim("C1", "Methods & more", (Part("a < b", "yes"),)),
-    Claim("C2", "Others", (Part("c", "no"),)),
-    Claim("C10", "Proofs", (), "none is given"),
-]
+CONFIG = validation.describe(StudyConfig())
+VERDICTS = "<h2>Verdicts</h2>"
 
 
 @pytest.fixture(scope="module")
@@ -65,10 +60,10 @@ def read(text):
 def test_the_page_shows_verdicts_results_and_figures(summary, tmp_path):
     picture = tmp_path / "figure3.png"
     picture.write_bytes(b"abc")
-    text = page.page(CONFIG, summary, CLAIMS, {"figure3": picture}, {"jax": "1.2"})
+    text = page.page(CONFIG, summary, {"figure3": picture}, {"jax": "1.2"}, verdicts=VERDICTS)
     reader = read(text)
     shown = " ".join(reader.shown)
-    for line in ("Methods & more", "yes: a < b", "not supported", "none is given", "jax 1.2"):
+    for line in ("Verdicts", "jax 1.2"):
         assert line in shown
     assert "hs-ddpg (N_T 5)" in shown
     assert "[0.29, 1.00]" in shown
@@ -76,14 +71,14 @@ def test_the_page_shows_verdicts_results_and_figures(summary, tmp_path):
 
 
 def test_the_page_loads_nothing_and_runs_nothing(summary, tmp_path):
-    text = page.page(CONFIG, summary, CLAIMS, {}, {})
+    text = page.page(CONFIG, summary, {}, {})
     assert "<script" not in text
     assert "http" not in text
 
 
 def test_a_run_over_episodes_is_told_in_episodes(summary):
     config = CONFIG | {"max_steps": None, "max_episodes": 30}
-    shown = " ".join(read(page.page(config, summary, [], {}, {}, by_episodes=True)).shown)
+    shown = " ".join(read(page.page(config, summary, {}, {}, by_episodes=True)).shown)
     assert "30 episodes each" in shown
     assert "episodes to solve, median" in shown
     assert "steps to solve" not in shown
@@ -91,11 +86,11 @@ def test_a_run_over_episodes_is_told_in_episodes(summary):
 
 def test_without_verdicts_or_figures_there_is_still_a_page(summary, tmp_path):
     gone = {"figure3": tmp_path / "gone.png"}
-    reader = read(page.page(CONFIG, summary, [], gone, {}))
+    reader = read(page.page(CONFIG, summary, gone, {}))
     assert reader.loaded == []
-    assert not any("claims" in line for line in reader.shown)
+    assert "Verdicts" not in reader.shown
 
 
 def test_the_page_does_not_say_where_the_run_lies(summary):
     config = CONFIG | {"out": "/somewhere/else"}
-    assert "/somewhere" not in page.page(config, summary, [], {}, {})
+    assert "/somewhere" not in page.page(config, summary, {}, {})

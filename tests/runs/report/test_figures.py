@@ -4,8 +4,8 @@ import polars as pl
 import pytest
 
 from cmedirl_jax.runs import statistics
+from cmedirl_jax.runs.report import curves, distributions, figures
 from cmedirl_jax.training.methods import METHODS
-from experiments import curves, distributions, figures
 from tests.support.cells import seeds_table
 
 THRESHOLD = 90.0
