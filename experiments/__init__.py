@@ -7,7 +7,7 @@ from collections.abc import Collection
 
 COMMANDS = (
     *("run_grid", "report", "compare", "claims"),
-    *("variants", "hot_starts", "optimal_return", "portraits"),
+    *("variants", "hot_starts", "optimal_return", "portraits", "datasets"),
 )
 
 

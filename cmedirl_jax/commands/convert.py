@@ -1,9 +1,11 @@
 """Read demonstrations of any format and write them in another.
 
 Example: cmedirl demos convert D4RL/pointmaze/open-v2 pool.npz --env PointMaze_Open-v3
+Example: cmedirl demos convert pool.csv good.csv --env Pendulum-v1 --min-return -200
 """
 
 import dataclasses
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +15,8 @@ from cmedirl_jax.commands import sources
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.formats.base import Format
 from cmedirl_jax.data.formats.reading import Actions
-from cmedirl_jax.runs.console import screen
+from cmedirl_jax.ranges import FINITE
+from cmedirl_jax.runs.console import screen, streams
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
 from cmedirl_jax.types import EnvSpec
@@ -29,6 +32,7 @@ class Options:
         env: Their task: they are held to it, and what is missing is computed where it can be.
         format: The source's format, where it does not look like what it is.
         actions: What happens to actions out of bounds.
+        min_return: Keep only the episodes that return as much.
     """
 
     source: Annotated[str, tyro.conf.Positional]
@@ -36,6 +40,7 @@ class Options:
     env: str
     format: str | None = None
     actions: Actions = "refuse"
+    min_return: Annotated[float, FINITE] | None = None
 
 
 def run(options: Options) -> int:
@@ -44,6 +49,8 @@ def run(options: Options) -> int:
     env = sources.task(options.env)
     try:
         pool = demonstrations.read(options.source, options.format, env=env, actions=options.actions)
+        if options.min_return is not None:
+            pool = _good(pool, options.min_return)
     except (FileNotFoundError, ModuleNotFoundError, ValueError) as error:
         raise UserError(" ".join(str(error).split())) from error
     write(options.target, pool, env.spec)
@@ -52,6 +59,13 @@ def run(options: Options) -> int:
         f"{options.target}: {int(pool.episode[-1]) + 1} episodes, {len(pool.episode)} steps",
     )
     return 0
+
+
+def _good(pool: demonstrations.Demonstrations, least: float) -> demonstrations.Demonstrations:
+    """The episodes that return at least so much."""
+    if "reward" in demonstrations.absent(pool):
+        raise ValueError("--min-return: the demonstrations have no rewards")
+    return demonstrations.keep(pool, demonstrations.returns(pool) >= least)
 
 
 def check_target(target: str) -> None:
@@ -74,10 +88,14 @@ def write(target: str, pool: demonstrations.Demonstrations, spec: EnvSpec) -> No
     """
     chosen = _format_of(target)
     assert chosen.write is not None
-    try:
-        chosen.write(target, pool, spec)
-    except (ModuleNotFoundError, ValueError) as error:
-        raise UserError(f"{target}: {' '.join(str(error).split())}") from error
+    with warnings.catch_warnings(record=True) as noted:
+        warnings.simplefilter("always")
+        try:
+            chosen.write(target, pool, spec)
+        except (ModuleNotFoundError, ValueError) as error:
+            raise UserError(f"{target}: {' '.join(str(error).split())}") from error
+    for warning in noted:
+        streams.complain(f"{target}: {warning.message}")
 
 
 def _format_of(target: str) -> Format:

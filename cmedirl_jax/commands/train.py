@@ -29,8 +29,6 @@ class Options(RunConfig):
     Attributes:
         methods: Which methods to train: the paper's ddpg, hs-ddpg, me-ddpg and hs-me-ddpg, and
             others, which a wrong name is answered by.
-        n_demos: Demonstrated trajectories of each learner; by default also all that --demos holds,
-            where it holds fewer.
         out: Folder of the results; default results/TASK.
     """
 

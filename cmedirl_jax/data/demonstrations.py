@@ -16,7 +16,7 @@ import numpy as np
 from cmedirl_jax import checks, ranges
 from cmedirl_jax.data.completion import clip, complete
 from cmedirl_jax.data.formats import FORMATS, load, parse, read, save
-from cmedirl_jax.data.formats.minari import from_minari, to_minari
+from cmedirl_jax.data.formats.minari import FACTS, from_minari, to_minari
 from cmedirl_jax.data.trajectories import from_trajectories
 from cmedirl_jax.data.validation import absent, check, validate
 from cmedirl_jax.types import Demonstrations, DemonstrationSubset, Numeric, Transition
@@ -34,6 +34,7 @@ __all__ = [
     "episodes",
     "from_minari",
     "from_trajectories",
+    "keep",
     "load",
     "parse",
     "read",
@@ -61,6 +62,34 @@ def returns(demonstrations: Demonstrations) -> np.ndarray:
     """The undiscounted return of each episode of the pool, `[E]`."""
     start = episodes(demonstrations).start
     return np.add.reduceat(np.asarray(demonstrations.transition.reward, np.float64), start)
+
+
+def keep(demonstrations: Demonstrations, kept: np.ndarray) -> Demonstrations:
+    """Some episodes of a pool, on the host.
+
+    Args:
+        demonstrations: the pool.
+        kept: `[E]` bool, which episodes stay, at least one. Of the metadata stay those that say
+            nothing of single episodes or experts, and the seeds.
+
+    Raises:
+        ValueError: if none stays.
+    """
+    if not np.any(kept):
+        raise ValueError(f"none of the {len(kept)} episodes stays")
+    length = episodes(demonstrations).length
+    rows = np.repeat(kept, length)
+    transition, truncated = jax.tree.map(
+        lambda leaf: np.asarray(leaf)[rows], (demonstrations.transition, demonstrations.truncated)
+    )
+    number = np.arange(np.sum(kept), dtype=np.int32)
+    known = demonstrations.metadata
+    metadata = {name: known[name] for name in ("env", *FACTS) if name in known}
+    if "seeds" in known:
+        metadata["seeds"] = [
+            seed for seed, stays in zip(known["seeds"], kept, strict=True) if stays
+        ]
+    return Demonstrations(transition, truncated, np.repeat(number, length[kept]), metadata)
 
 
 def subset(

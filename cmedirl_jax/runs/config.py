@@ -71,8 +71,8 @@ class RunConfig:
             follow each other, for tasks that draw random numbers; none: the task's sizes, for
             noisy demonstrations or those of another task.
         methods: Which methods to train.
-        n_demos: Demonstrated trajectories N_T per learner; several make Figures 4 and 5. By
-            default also all that --demos holds, where it holds fewer.
+        n_demos: Demonstrated trajectories N_T per learner; by default also all that --demos holds,
+            where it holds fewer.
         seeds: Independent learners per cell.
         seed: Seed of the whole run.
         max_steps: Environment steps per learner.
@@ -118,8 +118,9 @@ class StudyConfig(RunConfig):
     Attributes:
         preset: tuned: the setting that works; paper: the paper's letter; smoke: ends within a
             minute. Under tuned a task brings settings of its own, where it has some.
-        grid: main: one number of demonstrations; full: the paper's sweep over N_T, and under tuned
-            20,000 steps for each learner.
+        grid: main: one number of demonstrations; full: the paper's sweep over N_T, which makes
+            Figures 4 and 5, and under tuned 20,000 steps for each learner.
+        out: Folder of the results; default results/PRESET, or results/PRESET-full.
         evaluate_every_episodes: Also evaluate each learner whenever it has lived this many more
             episodes (the paper: 100).
         evaluation_starts_episodes: Start states of the evaluations by episodes.

@@ -1,5 +1,9 @@
 """Demonstrations of a run or of a function, recorded on the command line."""
 
+import numpy as np
+import pytest
+
+from cmedirl_jax.commands import demonstrators
 from cmedirl_jax.commands.cmedirl import main
 from cmedirl_jax.data import demonstrations
 from tests.support import pools
@@ -34,3 +38,34 @@ def test_record_plays_what_a_run_has_learned(untrained_run, tmp_path):
     pool = demonstrations.read(out, env=pools.ENV)
     assert len(pool.episode) == 999
     assert pool.truncated[-1]
+
+
+@pytest.mark.parametrize(
+    ("quality", "learners"), [("expert", [2]), ("medium", [3]), ("mixed", [0, 1, 2, 3])]
+)
+def test_a_quality_chooses_learners_by_what_they_return(quality, learners):
+    returns = np.array([-20.0, 90.0, 94.0, 40.0])
+    assert demonstrators.chosen_of(returns, -33.0, 94.0, quality) == learners
+
+
+def test_a_dataset_says_who_acted_and_has_reference_scores(untrained_run, tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    name = "test/car/mixed-v0"
+    of_run = ["--run", str(untrained_run), "--method", "ddpg", "--quality", "mixed"]
+    facts = ["--author", "a", "--author-email", "b", "--code-permalink", "c"]
+    assert main(["demos", "record", name, *of_run, *facts, "--episodes", "2"]) == 0
+    known = minari.load_dataset(name).storage.metadata
+    assert known["algorithm_name"] == "ddpg"
+    assert known["ref_min_score"] == pytest.approx(-33.1, abs=0.5)
+    for line in (
+        "2 episodes, 1998 steps",
+        "ddpg, mixed: every learner of 2",
+        "this dataset scores",
+    ):
+        assert line in known["description"]
+    assert str(untrained_run.parent) not in known["description"]
+    # Untrained learners play in turn, and differently.
+    pool = demonstrations.read(name, env=pools.ENV)
+    actions = np.asarray(pool.transition.action).reshape(2, 999)
+    assert not np.allclose(*actions)

@@ -171,3 +171,25 @@ def test_returns_equal_brute_force(lengths, discount):
 def test_discounts_of_returns_are_between_0_and_1(discount):
     with pytest.raises(ValueError, match=f"discount must be between 0 and 1, got {discount}"):
         demonstrations.discounted_returns(pools.random_pool([3]), discount)
+
+
+@given(lengths=pools.episode_lengths, data=st.data())
+def test_kept_episodes_are_those_of_the_pool_in_its_order(lengths, data):
+    pool = pools.random_pool(lengths)
+    pool = pool._replace(metadata={"env": "A-v0", "seeds": list(range(len(lengths))), "other": 1})
+    kept = np.array(
+        data.draw(st.lists(st.booleans(), min_size=len(lengths), max_size=len(lengths)))
+    )
+    if not kept.any():
+        with pytest.raises(ValueError, match="episodes stays"):
+            demonstrations.keep(pool, kept)
+        return
+    found = demonstrations.keep(pool, kept)
+    rows = np.isin(pool.episode, np.flatnonzero(kept))
+    np.testing.assert_array_equal(found.transition.observation, pool.transition.observation[rows])
+    np.testing.assert_array_equal(found.truncated, pool.truncated[rows])
+    np.testing.assert_array_equal(demonstrations.episodes(found).length, np.array(lengths)[kept])
+    assert found.metadata == {"env": "A-v0", "seeds": np.flatnonzero(kept).tolist()}
+    # Every episode kept: the same pool.
+    every = demonstrations.keep(pool, np.ones(len(lengths), bool))
+    chex.assert_trees_all_equal(every[:3], pool[:3])

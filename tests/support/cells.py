@@ -11,7 +11,8 @@ def rows(key):
         pl.lit(getattr(key, name)).alias(name) for name in ("study", "expert", "method", "n_demos")
     ]
     numbers = list(key.seed_range)
-    seeds = pl.DataFrame({"seed": numbers, "expert_id": numbers, "best_evaluation": 0.5})
+    same = {"best_evaluation": 0.5, "best_return": 0.5}
+    seeds = pl.DataFrame({"seed": numbers, "expert_id": numbers, **same})
     seeds = seeds.select(*labels, pl.all())
     evaluations = pl.concat(seeds.with_columns(env_step=step, return_mean=0.5) for step in (0, 9))
     return {"evaluations": evaluations, "episodes": seeds.head(0), "seeds": seeds}

@@ -17,15 +17,11 @@ from cmedirl_jax.types import Demonstrations, EnvSpec
 
 ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
 """What Minari calls a dataset."""
-_OF_DATASET = (
-    "dataset_id",
-    "algorithm_name",
-    "author",
-    "description",
-    "ref_min_score",
-    "ref_max_score",
+FACTS = (
+    *("algorithm_name", "author", "author_email", "code_permalink", "description"),
+    *("ref_min_score", "ref_max_score", "requirements"),
 )
-"""Metadata of a dataset that a pool keeps."""
+"""Metadata of a dataset that a pool keeps, and gives to another one."""
 
 
 def recognises(source: Any) -> bool:
@@ -65,7 +61,7 @@ def from_minari(source: str | Path, env: str | EnvSpec | None = None) -> Demonst
     except Exception as error:
         raise damaged(error) from error
     known = dataset.storage.metadata
-    kept: dict[str, Any] = {name: known[name] for name in _OF_DATASET if name in known}
+    kept: dict[str, Any] = {name: known[name] for name in ("dataset_id", *FACTS) if name in known}
     kept = {name: list(x) if isinstance(x, set | tuple) else x for name, x in kept.items()}
     seeds = [_seed(dataset, episode) for episode in episodes]
     if any(seed is not None for seed in seeds):
@@ -113,7 +109,7 @@ def to_minari(
         dataset_id: its id, `(namespace/)(name/)name-vN`.
         spec: the task's, whose bounds become the spaces'; default what the pool spans.
         **facts: further arguments of `minari.create_dataset_from_buffers`: author, ref_min_score
-            and so on.
+            and so on; default those of the pool's metadata.
 
     Raises:
         ValueError: for another form of id, one that is taken, or a pool without actions or rewards.
@@ -126,6 +122,14 @@ def to_minari(
     for name in absent(demonstrations):
         raise ValueError(f"Minari's datasets have {name}s, this pool has none")
     metadata, seeds = demonstrations.metadata, demonstrations.metadata.get("seeds", [])
+    known = {name: metadata[name] for name in FACTS if name in metadata}
+    # Minari takes one author as text, and more as a set.
+    known = {
+        name: set(x) if name.startswith("author") and isinstance(x, list) else x
+        for name, x in known.items()
+    }
+    facts = known | facts
+    env = facts.pop("env", None) or _gymnasiums(metadata["env"])
     buffers = [
         EpisodeBuffer(**_buffer(own), id=index, seed=seeds[index] if index < len(seeds) else None)
         for index, own in enumerate(_episodes(demonstrations))
@@ -137,10 +141,10 @@ def to_minari(
     return minari.create_dataset_from_buffers(
         dataset_id,
         buffers,
-        env=facts.pop("env", None) or _gymnasiums(metadata["env"]),
+        env=env,
         observation_space=box_of["observation"],
         action_space=box_of["action"],
-        **facts,
+        **{"eval_env": env, **facts},
     )
 
 

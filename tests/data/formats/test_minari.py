@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cmedirl_jax.data import demonstrations
+from tests.support import ROOT, pools
 from tests.support.formats import FACTS, SPEC, as_pool, episodes
 
 
@@ -30,6 +31,44 @@ def test_a_dataset_of_minaris_keeps_its_seeds_and_metadata(tmp_path):
         demonstrations.to_minari(pool, "no version", spec=SPEC)
     with pytest.raises(FileNotFoundError, match=r"fetch it by: minari download test/absent-v0"):
         demonstrations.read("test/absent-v0")
+
+
+def test_a_pool_gives_what_it_knows_of_itself_to_the_next_dataset():
+    minari = pytest.importorskip("minari")
+    facts = {name: value for name, value in FACTS.items() if name != "eval_env"}
+    demonstrations.to_minari(as_pool(episodes()), "test/first-v0", spec=SPEC, **facts)
+    again = demonstrations.from_minari("test/first-v0")
+    # A fact that was lost would be warned of, and warnings are errors here.
+    demonstrations.to_minari(again, "test/second-v0", spec=SPEC)
+    first, second = (
+        minari.load_dataset(f"test/{name}-v0").storage.metadata for name in ("first", "second")
+    )
+    assert {**first, "dataset_id": None} == {**second, "dataset_id": None}
+
+
+def test_the_cars_dataset_is_minaris_and_the_tasks_own(monkeypatch):
+    """It was made by `python -m experiments.datasets`."""
+    minari = pytest.importorskip("minari")
+    folder = ROOT / "tests" / "support" / "minari"
+    assert sum(path.stat().st_size for path in folder.rglob("*")) < 5e6
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
+    # By Minari alone: its environment plays the first episode again.
+    dataset = minari.load_dataset("classic-control/mountaincarcontinuous/expert-v0")
+    assert dataset.total_episodes == 100
+    env, episode = dataset.recover_environment(), dataset[0]
+    observation, _ = env.reset(seed=0)
+    for action, seen, paid in zip(
+        episode.actions, episode.observations, episode.rewards, strict=False
+    ):
+        np.testing.assert_allclose(observation, seen, atol=1e-5)
+        observation, reward, *_ = env.step(action)
+        assert reward == pytest.approx(paid, abs=1e-4)
+    assert minari.get_normalized_score(dataset, np.array([97.0]))[0] > 0.98
+    # By us: every step is the task's own.
+    pool = demonstrations.read(dataset.spec.dataset_id, env=pools.ENV)
+    demonstrations.check(pool, pools.ENV)
+    assert demonstrations.returns(pool).mean() == pytest.approx(96.0, abs=0.1)
+    assert pool.metadata["seeds"] == list(range(100))
 
 
 def test_a_minari_dataset_of_an_environment_that_is_not_here(tmp_path):

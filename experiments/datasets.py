@@ -1,0 +1,151 @@
+"""`python -m experiments.datasets`: Minari datasets of the car and the pendulum.
+
+The best of DDPG agents that are trained to the end demonstrates (expert). Of others, which are
+trained until about half of them solve the task, demonstrate the one nearest to half way from random
+actions to the expert (medium), and all in turn (mixed). The datasets go where Minari keeps its own;
+those that are there stay. The table is made by loading them with Minari alone.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+import polars as pl
+from rich import box
+from rich.table import Table
+
+from cmedirl_jax.commands import cmedirl
+from cmedirl_jax.commands.demonstrators import Quality
+from cmedirl_jax.ranges import Size
+from cmedirl_jax.runs.console import ending, screen
+from cmedirl_jax.runs.console.options import read
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import outputs
+
+
+class Task(NamedTuple):
+    """A task, and for how many environment steps its agents train.
+
+    Attributes:
+        env: its name.
+        name: what its datasets' names begin with.
+        steps: of the experts.
+        medium_steps: of the others.
+    """
+
+    env: str
+    name: str
+    steps: int
+    medium_steps: int
+
+
+TASKS = (
+    Task("MountainCarContinuous-v0", "classic-control/mountaincarcontinuous", 12_000, 3_500),
+    Task("Pendulum-v1", "classic-control/pendulum", 10_000, 7_000),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How many, and what the datasets say of who made them.
+
+    Attributes:
+        seeds: Agents of each task.
+        episodes: Of each dataset.
+        author: Who makes them.
+        author_email: How to reach them.
+        code_permalink: The code that makes them.
+        out: Folder of the runs, and of the table datasets.csv.
+    """
+
+    seeds: Size = 32
+    episodes: Size = 100
+    author: str = "cmedirl_jax"
+    author_email: str = "none"
+    code_permalink: str = "none"
+    out: Path = Path("results/datasets")
+
+
+@ending.in_a_line("datasets")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    options = read(Options, "experiments.datasets", __doc__, arguments)
+    outputs.check("out", options.out / "datasets.csv")
+    try:
+        import minari  # type: ignore[import-not-found]
+    except ModuleNotFoundError as error:
+        raise UserError(f"{error}; run: python -m pip install -e '.[minari]'") from error
+    rows = []
+    for task in TASKS:
+        best: list[str] = []
+        for quality in get_args(Quality):
+            name = f"{task.name}/{quality}-v0"
+            for command in _commands(task, name, quality, options, best) if _new(name) else ():
+                if code := cmedirl.main(command):
+                    return code
+            dataset = minari.load_dataset(name, download=False)
+            # One expert is what all three are measured by.
+            best = ["--ref-max-score", str(dataset.storage.metadata["ref_max_score"])]
+            rows.append(described(dataset))
+    table = pl.DataFrame(rows)
+    outputs.write(options.out / "datasets.csv", table.write_csv(float_precision=2).encode())
+    screen.show(screen.console(), shown(table))
+    return 0
+
+
+def _new(name: str) -> bool:
+    import minari  # type: ignore[import-not-found]
+
+    return name not in minari.list_local_datasets()
+
+
+def _commands(
+    task: Task, name: str, quality: Quality, options: Options, best: list[str]
+) -> list[list[str]]:
+    """What `cmedirl` is given: to train the agents, and to record a dataset of their policies."""
+    steps = task.steps if quality == "expert" else task.medium_steps
+    run = str(options.out / f"{task.env}-{steps}")
+    train = ["train", "--env", task.env, "--method", "ddpg", "--max-steps", str(steps)]
+    record = ["demos", "record", name, "--run", run, "--quality", quality, *best]
+    facts = ["--author", options.author, "--author-email", options.author_email]
+    facts += ["--code-permalink", options.code_permalink]
+    return [
+        [*train, "--seeds", str(options.seeds), "--out", run],
+        [*record, "--episodes", str(options.episodes), *facts],
+    ]
+
+
+def described(dataset: Any) -> dict[str, Any]:
+    """A row on a dataset of Minari's, from nothing but itself."""
+    returns = pl.Series([float(sum(each.rewards)) for each in dataset.iterate_episodes()])
+    known = dataset.storage.metadata
+    worst, best = known["ref_min_score"], known["ref_max_score"]
+    return {
+        "dataset": dataset.spec.dataset_id,
+        "episodes": int(dataset.total_episodes),
+        "steps": int(dataset.total_steps),
+        "return_mean": returns.mean(),
+        "return_std": returns.std(ddof=0),
+        "return_min": returns.min(),
+        "return_max": returns.max(),
+        "ref_min_score": worst,
+        "ref_max_score": best,
+        "score": (returns.mean() - worst) / (best - worst),
+        "megabytes": known["dataset_size"],
+    }
+
+
+def shown(table: pl.DataFrame) -> Table:
+    """The table as a terminal shows it."""
+    printed = Table(box=box.SIMPLE)
+    for name in table.columns:
+        printed.add_column(name.replace("_", "\n"))
+    for row in table.iter_rows():
+        printed.add_row(*(f"{x:.2f}" if isinstance(x, float) else str(x) for x in row))
+    return printed
+
+
+if __name__ == "__main__":
+    sys.exit(main())
