@@ -23,7 +23,7 @@ from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.cluster.base import Cluster
 from cmedirl_jax.runs.console import screen
 from cmedirl_jax.runs.console.phases import phase
-from cmedirl_jax.runs.console.progress import Reporter, reporter
+from cmedirl_jax.runs.console.progress import Reporter, reporter, stepwise
 from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.storage import cells, checkpoints, plain, tables
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
@@ -223,7 +223,7 @@ def _train_experts(
         plan.experts,
         session.compiled(METHODS["ddpg"], plan.experts.settings, count),
         plan.budget.evaluation_starts,
-        _stepwise(report, plan.experts.seeds),
+        stepwise(report, plan.experts.seeds),
         checkpointer,
         session.cluster,
     )
@@ -312,22 +312,7 @@ def _train(
         **block,
         budget=budget if cell.method.interacts else dataclasses.replace(budget, max_steps=0),
         threshold=solved,
-        report=_stepwise(report, len(cell.block)),
+        report=stepwise(report, len(cell.block)),
         checkpointer=checkpointer,
     )
     return result, programs.evaluator
-
-
-def _stepwise(report: Reporter, seeds_count: int) -> Callable[[cell_lib.Progress], None]:
-    """Report a cell's progress, which counts from its first step, as increments."""
-    before: int | None = None
-
-    def advance(progress: cell_lib.Progress) -> None:
-        nonlocal before
-        if before is None:
-            report.go_on(progress.env_step * seeds_count)
-        else:
-            report.advance((progress.env_step - before) * seeds_count, progress.solved_fraction)
-        before = progress.env_step
-
-    return advance
