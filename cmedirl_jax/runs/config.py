@@ -104,6 +104,9 @@ class StudyConfig:
         process_id: With coordinator: which of them this is, from 0; process 0 alone writes results.
         checkpoint_every: Seconds from one checkpoint of the training to the next; 0: one after
             every chunk.
+        log: Loggers that write each cell's evaluations to OUT/log while it trains: csv,
+            tensorboard, wandb (offline); the last two need the extra log.
+        log_seeds: Also log each seed, beside the means over the seeds.
     """
 
     preset: Literal["tuned", "paper", "smoke"] = "tuned"
@@ -133,6 +136,8 @@ class StudyConfig:
     processes: Size | None = None
     process_id: Count | None = None
     checkpoint_every: NotNegative = 60.0
+    log: tuple[str, ...] = ()
+    log_seeds: bool = False
     experts: ExpertSettings = ExpertSettings()
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
 
