@@ -88,6 +88,9 @@ class RunConfig:
         group: Seeds that a device steps together; default: what is fastest for the networks' width.
         checkpoint_every: Seconds from one checkpoint of the training to the next; 0: one after
             every chunk.
+        log: Loggers that write each cell's evaluations to OUT/log while it trains: csv,
+            tensorboard, wandb (offline); the last two need the extra log.
+        log_seeds: Also log each seed, beside the means over the seeds.
     """
 
     env: str = "MountainCarContinuous-v0"
@@ -108,6 +111,8 @@ class RunConfig:
     devices: Size | None = None
     group: Size | None = None
     checkpoint_every: NotNegative = 60.0
+    log: tuple[str, ...] = ()
+    log_seeds: bool = False
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
 
 

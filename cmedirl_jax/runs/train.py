@@ -23,8 +23,10 @@ from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.cluster.base import Cluster
 from cmedirl_jax.runs.console import screen
 from cmedirl_jax.runs.console.phases import phase
-from cmedirl_jax.runs.console.progress import Reporter, reporter
+from cmedirl_jax.runs.console.progress import Reporter, reporter, stepwise
 from cmedirl_jax.runs.console.signals import Interruption
+from cmedirl_jax.runs.loggers import base as loggers
+from cmedirl_jax.runs.loggers.background import Log
 from cmedirl_jax.runs.storage import cells, checkpoints, plain, tables
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.runs.storage import folder as run_folder
@@ -91,6 +93,17 @@ class Session(NamedTuple):
             interruption=self.interruption,
             say=functools.partial(screen.say, self.console),
             cluster=self.cluster,
+        )
+
+    def log(self, cell: Cell, pool: LearnersPool | None) -> Log:
+        """Logs a cell, on process 0."""
+        return Log(
+            self.plan.folder / loggers.FOLDER / cell.name,
+            self.plan.log if self.cluster.writer else (),
+            cell.block,
+            each_seed=self.plan.log_seeds,
+            experts=pool.expert if pool is not None and cell.n_demos else None,
+            config=self.plan.config,
         )
 
 
@@ -223,7 +236,7 @@ def _train_experts(
         plan.experts,
         session.compiled(METHODS["ddpg"], plan.experts.settings, count),
         plan.budget.evaluation_starts,
-        _stepwise(report, plan.experts.seeds),
+        stepwise(report, plan.experts.seeds),
         checkpointer,
         session.cluster,
     )
@@ -238,7 +251,8 @@ def _train_cell(
     report: Reporter,
 ) -> None:
     """Train a cell, evaluate its best policies, and save it."""
-    result, evaluator = _train(session, checkpointer, cell, pool, solved, report)
+    with session.log(cell, pool) as log:
+        result, evaluator = _train(session, checkpointer, cell, pool, solved, report, log)
     plan, fresh_starts = session.plan, session.keys.fresh_starts
 
     # Evaluate each seed's best policy, in JAX and in Gymnasium.
@@ -286,6 +300,7 @@ def _train(
     pool: LearnersPool | None,
     solved: float,
     report: Reporter,
+    log: Log,
 ) -> tuple[CellResult, Evaluator]:
     """Train a cell; gives its evaluator too."""
     plan, key, budget = session.plan, session.keys.learners, session.plan.budget
@@ -302,6 +317,7 @@ def _train(
             evaluation_starts=budget.evaluation_starts,
             checkpointer=checkpointer,
         )
+        log.follow(result.evaluations)
         return result, fit.evaluator
     programs = session.compiled(cell.method, plan.settings, len(cell.block))
     result = cell_lib.train(
@@ -312,22 +328,7 @@ def _train(
         **block,
         budget=budget if cell.method.interacts else dataclasses.replace(budget, max_steps=0),
         threshold=solved,
-        report=_stepwise(report, len(cell.block)),
+        report=stepwise(report, len(cell.block), log.follow),
         checkpointer=checkpointer,
     )
     return result, programs.evaluator
-
-
-def _stepwise(report: Reporter, seeds_count: int) -> Callable[[cell_lib.Progress], None]:
-    """Report a cell's progress, which counts from its first step, as increments."""
-    before: int | None = None
-
-    def advance(progress: cell_lib.Progress) -> None:
-        nonlocal before
-        if before is None:
-            report.go_on(progress.env_step * seeds_count)
-        else:
-            report.advance((progress.env_step - before) * seeds_count, progress.solved_fraction)
-        before = progress.env_step
-
-    return advance

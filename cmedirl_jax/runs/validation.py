@@ -22,6 +22,7 @@ from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.cluster.base import ALONE, Cluster
 from cmedirl_jax.runs.config import DemosCheck, Experts, StudyConfig
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.loggers import registry
 from cmedirl_jax.runs.storage import cells, plain
 from cmedirl_jax.tabular import imitation
 from cmedirl_jax.training import compose, needs
@@ -46,6 +47,8 @@ class Plan(NamedTuple):
         subset_size: the largest number of demonstrations of a learner.
         group: seeds that a device steps together; None: what is fastest.
         checkpoint_every: seconds from one checkpoint to the next.
+        log: the loggers' names.
+        log_seeds: whether they log each seed too.
         demos: the demonstrations that the user gave, or None.
         experts: who demonstrates if none were given.
     """
@@ -61,6 +64,8 @@ class Plan(NamedTuple):
     subset_size: int
     group: int | None
     checkpoint_every: float
+    log: tuple[str, ...]
+    log_seeds: bool
     demos: Demonstrations | None
     experts: Experts
 
@@ -124,6 +129,8 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool =
         subset_size=max(config.n_demos),
         group=config.group,
         checkpoint_every=config.checkpoint_every,
+        log=config.log,
+        log_seeds=config.log_seeds,
         demos=demos,
         experts=config.resolved_experts,
     )
@@ -169,6 +176,7 @@ def check(config: StudyConfig) -> Env | HostEnv:
     for method in config.methods:
         if method not in METHODS:
             raise UserError(f"--methods: unknown method {method!r}; there are {', '.join(METHODS)}")
+    _check_log(config)
     try:
         env = envs.find(config.env, asynchronous=config.asynchronous)
         if isinstance(env, Env):
@@ -196,6 +204,18 @@ def check(config: StudyConfig) -> Env | HostEnv:
         asked = cells.asked(config.methods, config.n_demos)
         _check_enough(asked, config.resolved_experts.trajectories)
     return env
+
+
+def _check_log(config: StudyConfig) -> None:
+    """Refuse loggers that are not there, or say nothing."""
+    try:
+        registry.check(config.log)
+    except ValueError as error:
+        raise UserError(f"--log: {error}") from error
+    if len(set(config.log)) < len(config.log):
+        raise UserError("--log: give each once")
+    if config.log_seeds and not config.log:
+        raise UserError("--log-seeds: there is no --log")
 
 
 def _check_host(config: StudyConfig, on_host: bool) -> None:

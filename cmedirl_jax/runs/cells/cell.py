@@ -1,7 +1,7 @@
 """Training one cell: a method, a number of demonstrations, a block of seeds side by side."""
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -22,10 +22,11 @@ CHUNK = 250
 
 
 class Progress(NamedTuple):
-    """Where a cell stands after a chunk: steps taken by each seed, share at the threshold."""
+    """Where a cell stands: steps taken by each seed, share at the threshold, all evaluations."""
 
     env_step: int
     solved_fraction: float
+    evaluations: Sequence[EvaluationRows]
 
 
 class CellResult(NamedTuple):
@@ -100,12 +101,12 @@ def train(
         training = _Training.resume(programs, data, n_demos, budget, slots, shapes(), saved)
 
     # Train, chunk after chunk.
-    report(Progress(training.step, training.record.solved_fraction(threshold)))
+    report(training.progress(threshold))
     for stop in _chunk_ends(training.step, budget):
         if not training.record.running.any():
             break
         training.advance(stop)
-        report(Progress(stop, training.record.solved_fraction(threshold)))
+        report(training.progress(threshold))
         if checkpointer is not None:
             checkpointer.save_if_due(stop, training.snapshot)
     return training.result()
@@ -228,6 +229,11 @@ class _Training:
             returns[due] = evaluation.return_mean[due]
             actor = _take(self.state.agent.actor, slots.of_seed)
             self.best, self.best_return = _keep_best(self.best, self.best_return, actor, returns)
+
+    def progress(self, threshold: float) -> Progress:
+        """Where the cell stands."""
+        solved = self.record.solved_fraction(threshold)
+        return Progress(self.step, solved, self.record.evaluations)
 
     def result(self) -> CellResult:
         """The finished cell."""

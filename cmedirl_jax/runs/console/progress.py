@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -10,6 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
+from cmedirl_jax.runs.cells import cell
+from cmedirl_jax.runs.cells.record import EvaluationRows
 from cmedirl_jax.runs.console import compile_cache, screen
 
 PLAIN_INTERVAL = 10.0
@@ -30,6 +32,32 @@ class Reporter(Protocol):
     def advance(self, learning_steps: int, solved_fraction: float) -> None:
         """The part took so many more learning steps; this share of its seeds solves the task."""
         ...
+
+
+def stepwise(
+    report: Reporter,
+    seeds_count: int,
+    follow: Callable[[Sequence[EvaluationRows]], None] = lambda evaluations: None,
+) -> Callable[[cell.Progress], None]:
+    """Report a cell's progress, which counts from its first step, as increments.
+
+    Args:
+        report: where.
+        seeds_count: how many seeds the cell has.
+        follow: called each time with all evaluations so far.
+    """
+    before: int | None = None
+
+    def advance(progress: cell.Progress) -> None:
+        nonlocal before
+        if before is None:
+            report.go_on(progress.env_step * seeds_count)
+        else:
+            report.advance((progress.env_step - before) * seeds_count, progress.solved_fraction)
+        before = progress.env_step
+        follow(progress.evaluations)
+
+    return advance
 
 
 @contextlib.contextmanager

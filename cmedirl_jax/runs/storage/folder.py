@@ -15,6 +15,7 @@ from cmedirl_jax import envs
 from cmedirl_jax.io import atomic
 from cmedirl_jax.runs import numerics
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.loggers import base as loggers
 from cmedirl_jax.runs.storage import cells, checkpoints, outputs, sealing
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 
@@ -22,7 +23,10 @@ PACKAGES = (
     *("cmedirl-jax", "jax", "jaxlib", "flax", "optax"),
     *("chex", "gymnasium", "numpy", "orbax-checkpoint"),
 )
-FOLDERS = (stored_demonstrations.FOLDER, checkpoints.FOLDER, cells.FOLDER, "figures")
+FOLDERS = (
+    *(stored_demonstrations.FOLDER, checkpoints.FOLDER, cells.FOLDER),
+    *("figures", loggers.FOLDER),
+)
 FILES = (
     *("config.json", "summary.csv", "claims.md", "report.html"),
     *(f"{name}.parquet" for name in cells.TABLES),
@@ -33,6 +37,7 @@ _LOCK = ".lock"
 NOT_COMPARED = (
     *("out", "grid", "devices", "distributed", "coordinator", "processes", "process_id"),
     *("checkpoint_every", "check_demos", "demos_format", "demos_actions", "asynchronous"),
+    *("log", "log_seeds"),
     *CELLS_ASKED,
 )
 """The options that runs of one configuration may differ in."""

@@ -16,7 +16,7 @@ from cmedirl_jax.io import checkpoint
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.cells import compiled as compiled_lib
-from cmedirl_jax.runs.cells.cell import CellResult, Progress
+from cmedirl_jax.runs.cells.cell import CellResult
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.console.signals import Interruption
 from cmedirl_jax.runs.errors import Interrupted
@@ -46,12 +46,20 @@ class Chunk(NamedTuple):
     groups: int
 
 
+class Report(NamedTuple):
+    """A cell's progress, as it was when it was reported."""
+
+    env_step: int
+    solved_fraction: float
+    evaluations: int
+
+
 class Trained(NamedTuple):
     """A cell, and what it was made from."""
 
     result: CellResult
     chunks: list[Chunk]
-    reports: list[Progress]
+    reports: list[Report]
 
 
 def compile_linear(env, method="ddpg", subset_size=None):
@@ -116,7 +124,9 @@ def train(
             first_seed=first_seed,
             budget=budget,
             threshold=threshold,
-            report=reports.append,
+            report=lambda found: reports.append(
+                Report(found.env_step, found.solved_fraction, len(found.evaluations))
+            ),
             checkpointer=checkpointer,
         )
     return Trained(result, chunks, reports)
@@ -272,13 +282,14 @@ def test_the_best_policy_returns_each_seeds_highest_evaluation(run, request, pro
     np.testing.assert_array_equal(mean_return(programs, result.best, STARTS), highest)
 
 
-def test_reports_follow_the_steps_and_the_share_of_seeds_at_the_threshold(programs, by_steps):
+def test_reports_follow_steps_the_share_at_the_threshold_and_evaluations(programs, by_steps):
     returns = [found.evaluation.return_mean for found in by_steps.result.evaluations]
     threshold = float(np.median(returns))
     first, second, third, last = (np.mean(values >= threshold) for values in returns)
-    expected = zip(range(0, 126, CHUNK), (first, first, second, second, third, last), strict=True)
+    solved = (first, first, second, second, third, last)
+    expected = zip(range(0, 126, CHUNK), solved, (1, 1, 2, 2, 3, 4), strict=True)
     reports = train(programs, BY_STEPS, threshold=threshold).reports
-    assert reports == [Progress(*report) for report in expected]
+    assert reports == [Report(*report) for report in expected]
 
 
 def test_each_seed_ends_with_its_last_episode(by_episodes):

@@ -1,0 +1,1 @@
+"""Logs of a run's evaluations, written while it trains."""
