@@ -1,9 +1,9 @@
 """`python -m experiments.datasets`: Minari datasets of the car and the pendulum.
 
-The best of DDPG agents that are trained to the end demonstrates (expert). Of others, which are
-trained until about half of them solve the task, demonstrate the one nearest to half way from random
-actions to the expert (medium), and all in turn (mixed). The datasets go where Minari keeps its own;
-those that are there stay. The table is made by loading them with Minari alone.
+Three for each task. expert: the best of DDPG agents that were trained to the end. Other agents are
+stopped when about half of them solve the task. medium: the one of these that is nearest to half way
+from random actions to the expert. mixed: all of these in turn. The datasets go where Minari keeps
+its own; those that are there stay. The table is made by loading them with Minari alone.
 """
 
 import dataclasses
@@ -63,8 +63,8 @@ class Options:
     seeds: Size = 32
     episodes: Size = 100
     author: str = "cmedirl_jax"
-    author_email: str = "none"
-    code_permalink: str = "none"
+    author_email: str | None = None
+    code_permalink: str | None = None
     out: Path = Path("results/datasets")
 
 
@@ -79,15 +79,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise UserError(f"{error}; run: python -m pip install -e '.[minari]'") from error
     rows = []
     for task in TASKS:
-        best: list[str] = []
+        reference: list[str] = []
         for quality in get_args(Quality):
             name = f"{task.name}/{quality}-v0"
-            for command in _commands(task, name, quality, options, best) if _new(name) else ():
+            for command in _commands(task, name, quality, options, reference) if _new(name) else ():
                 if code := cmedirl.main(command):
                     return code
             dataset = minari.load_dataset(name, download=False)
+            _check(dataset, name, options)
             # One expert is what all three are measured by.
-            best = ["--ref-max-score", str(dataset.storage.metadata["ref_max_score"])]
+            reference = ["--ref-max-score", str(dataset.storage.metadata["ref_max_score"])]
             rows.append(described(dataset))
     table = pl.DataFrame(rows)
     outputs.write(options.out / "datasets.csv", table.write_csv(float_precision=2).encode())
@@ -102,19 +103,26 @@ def _new(name: str) -> bool:
 
 
 def _commands(
-    task: Task, name: str, quality: Quality, options: Options, best: list[str]
+    task: Task, name: str, quality: Quality, options: Options, reference: list[str]
 ) -> list[list[str]]:
     """What `cmedirl` is given: to train the agents, and to record a dataset of their policies."""
-    steps = task.steps if quality == "expert" else task.medium_steps
-    run = str(options.out / f"{task.env}-{steps}")
+    steps, seed = (task.steps, 0) if quality == "expert" else (task.medium_steps, 1)
+    run = str(options.out / f"{task.env}-seed-{seed}")
     train = ["train", "--env", task.env, "--method", "ddpg", "--max-steps", str(steps)]
-    record = ["demos", "record", name, "--run", run, "--quality", quality, *best]
-    facts = ["--author", options.author, "--author-email", options.author_email]
-    facts += ["--code-permalink", options.code_permalink]
-    return [
-        [*train, "--seeds", str(options.seeds), "--out", run],
-        [*record, "--episodes", str(options.episodes), *facts],
-    ]
+    train += ["--seed", str(seed), "--seeds", str(options.seeds), "--out", run]
+    record = ["demos", "record", name, "--run", run, "--quality", quality, *reference]
+    for fact in ("author", "author_email", "code_permalink"):
+        if (value := getattr(options, fact)) is not None:
+            record += [f"--{fact.replace('_', '-')}", value]
+    return [train, [*record, "--episodes", str(options.episodes)]]
+
+
+def _check(dataset: Any, name: str, options: Options) -> None:
+    """Refuse a dataset of that name which this command would not have made."""
+    if dataset.total_episodes != options.episodes:
+        raise UserError(f"--episodes: {name} is there and has {dataset.total_episodes}")
+    if "ref_max_score" not in dataset.storage.metadata:
+        raise UserError(f"{name} is there and has no reference scores")
 
 
 def described(dataset: Any) -> dict[str, Any]:

@@ -27,7 +27,8 @@ from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import DemonstrationSubset
 from cmedirl_jax.envs import Env
 from cmedirl_jax.ranges import Size
-from cmedirl_jax.runs import intervals, start, validation
+from cmedirl_jax.runs import demonstrations as given
+from cmedirl_jax.runs import intervals, start
 from cmedirl_jax.runs.cells import pools
 from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.console import compile_cache, ending, screen
@@ -96,7 +97,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise UserError(f"--env: {error}") from error
     if not isinstance(env, Env):
         raise UserError(f"--env: it needs a task in JAX, {options.env} is not")
-    pool = validation.load_demonstrations(options.demos, env, "dynamics")
+    pool = given.load(options.demos, env, "dynamics")
     shared = pools.of_learners(pool, options.seeds)
     table = pl.DataFrame([_row(critic, shared, env, options) for critic in CRITICS])
     screen.show(screen.console(), shown(table))

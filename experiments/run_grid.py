@@ -7,10 +7,11 @@ from pathlib import Path
 
 import tyro
 
-from cmedirl_jax.runs import command
 from cmedirl_jax.runs.cluster import processes
 from cmedirl_jax.runs.config import StudyConfig
 from cmedirl_jax.runs.console import ending
+from cmedirl_jax.runs.console.options import read_first
+from cmedirl_jax.runs.execute import execute
 from cmedirl_jax.runs.report.base import Report
 from experiments import presets
 
@@ -20,10 +21,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     config = parse(arguments)
-    fewer_will_do = _read_first(arguments).n_demos is None
+    fewer_will_do = not _read_first(arguments).n_demos_given
 
     def work() -> int:
-        return command.work("run_grid", config, _report, fewer_will_do=fewer_will_do)
+        return execute("run_grid", config, _report, fewer_will_do=fewer_will_do)
 
     processes.check(config.cluster)
     if not config.cluster.several:
@@ -53,14 +54,7 @@ def parse(arguments: Sequence[str]) -> StudyConfig:
 
 
 def _read_first(arguments: Sequence[str]) -> argparse.Namespace:
-    # These decide every other default, which tyro needs; it reports a wrong one.
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--preset", default="tuned")
-    parser.add_argument("--grid", default="main")
-    parser.add_argument("--env", default=presets.CAR)
-    # A default number of demonstrations is no more than a file holds; a number given is meant.
-    parser.add_argument("--n-demos", "--n_demos", nargs="*")
-    return parser.parse_known_args(list(arguments))[0]
+    return read_first(arguments, preset="tuned", grid="main", env=presets.CAR)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,10 @@ TOP = (
     *("networks", "normalisation", "observation_statistics"),
     *("products", "optimizers", "grids", "modes"),
 )
-ROOMS = ("io", "envs", "data", "agents", "irl", "tabular", "training", "runs", "commands")
+ROOMS = (
+    *("io", "envs", "data", "agents", "irl", "tabular", "training", "assess"),
+    *("runs", "commands"),
+)
 ORDER = dict.fromkeys(TOP, 0) | {name: place + 1 for place, name in enumerate(ROOMS)}
 # What only the command line and the experiments need.
 CLI = ("PIL", "filelock", "matplotlib", "platformdirs", "polars", "rich", "scipy", "tyro")

@@ -61,9 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _commands(arguments: Sequence[str]) -> Any:
     """The union of the commands' options; some defaults depend on the arguments."""
-    of_train = tyro.conf.subcommand(
-        "train", default=train.default(arguments), description=train.__doc__
-    )
+    # The task's module is imported for its settings: for no other command.
+    default = train.default(arguments) if arguments[:1] == ["train"] else train.Options()
+    of_train = tyro.conf.subcommand("train", default=default, description=train.__doc__)
     of_evaluate = tyro.conf.subcommand("evaluate", description=evaluate.__doc__)
     of_watch = tyro.conf.subcommand("watch", description=watch.__doc__)
     return (

@@ -32,7 +32,7 @@ class Options:
         env: Their task: they are held to it, and what is missing is computed where it can be.
         format: The source's format, where it does not look like what it is.
         actions: What happens to actions out of bounds.
-        min_return: Keep only the episodes that return as much.
+        min_return: Keep only the episodes that return at least this much.
     """
 
     source: Annotated[str, tyro.conf.Positional]
@@ -49,10 +49,10 @@ def run(options: Options) -> int:
     env = sources.task(options.env)
     try:
         pool = demonstrations.read(options.source, options.format, env=env, actions=options.actions)
-        if options.min_return is not None:
-            pool = _good(pool, options.min_return)
     except (FileNotFoundError, ModuleNotFoundError, ValueError) as error:
         raise UserError(" ".join(str(error).split())) from error
+    if options.min_return is not None:
+        pool = _good(pool, options.min_return)
     write(options.target, pool, env.spec)
     screen.say(
         screen.console(),
@@ -64,8 +64,13 @@ def run(options: Options) -> int:
 def _good(pool: demonstrations.Demonstrations, least: float) -> demonstrations.Demonstrations:
     """The episodes that return at least so much."""
     if "reward" in demonstrations.absent(pool):
-        raise ValueError("--min-return: the demonstrations have no rewards")
-    return demonstrations.keep(pool, demonstrations.returns(pool) >= least)
+        raise UserError("--min-return: the demonstrations have no rewards")
+    returns = demonstrations.returns(pool)
+    if returns.max() < least:
+        raise UserError(
+            f"--min-return: the best of {len(returns)} episodes returns {returns.max():.4g}"
+        )
+    return demonstrations.keep(pool, returns >= least)
 
 
 def check_target(target: str) -> None:
@@ -94,8 +99,9 @@ def write(target: str, pool: demonstrations.Demonstrations, spec: EnvSpec) -> No
             chosen.write(target, pool, spec)
         except (ModuleNotFoundError, ValueError) as error:
             raise UserError(f"{target}: {' '.join(str(error).split())}") from error
-    for warning in noted:
-        streams.complain(f"{target}: {warning.message}")
+        finally:
+            for warning in noted:
+                streams.complain(f"{target}: {warning.message}")
 
 
 def _format_of(target: str) -> Format:

@@ -35,7 +35,7 @@ class Options:
         out: A file that ends in .npz, .csv or .parquet, or the id of a new dataset of Minari's.
         run: A run's folder, whose policies demonstrate.
         method: Of the run, where it has several.
-        seed: Which of its learners.
+        seed: Which of its learners; default 0.
         quality: Of the learners' policies, in place of a seed. expert: the best one; medium: the
             one whose return lies nearest to half way from random actions to the expert's; mixed:
             all of them in turn.
@@ -54,7 +54,7 @@ class Options:
     out: Annotated[str, tyro.conf.Positional]
     run: Path | None = None
     method: str | None = None
-    seed: Count = 0
+    seed: Count | None = None
     quality: Quality | None = None
     ref_max_score: Annotated[float, FINITE] | None = None
     n_demos: Size | None = None
@@ -70,7 +70,8 @@ class Options:
 def run(options: Options) -> int:
     """Run the command; returns its exit code."""
     convert.check_target(options.out)
-    who = _demonstrators(options)
+    _check(options)
+    who = _of_run(options) if options.run is not None else _of_function(options)
     env = sources.task(who.task)
     pool = record(env, who.policies, options.episodes, options.reset_seed)
     facts = {name: getattr(options, name) for name in ("author", "author_email", "code_permalink")}
@@ -90,18 +91,41 @@ def run(options: Options) -> int:
     return 0
 
 
-def _demonstrators(options: Options) -> Demonstrators:
+def _check(options: Options) -> None:
+    """Refuse options that contradict each other, or that say nothing to the others."""
     if (options.run is None) == (options.policy is None):
         raise UserError("give either --run, or --policy and --env")
-    if options.run is not None:
-        one = sources.policy(options.run, options.method, options.seed, options.n_demos)
-        if options.quality is None:
-            return demonstrators.of_seed(options.run, one, options.seed)
-        return demonstrators.of_quality(
-            options.run, one, options.n_demos, options.quality, options.ref_max_score
-        )
-    if options.env is None:
+    if options.policy is not None and options.env is None:
         raise UserError("--env: name the task that --policy acts in")
+    others = ("method", "seed", "quality", "n_demos", "ref_max_score")
+    for name in others if options.policy is not None else ("env",):
+        if getattr(options, name) is not None:
+            other = "policy" if options.policy is not None else "run"
+            raise UserError(f"--{name.replace('_', '-')}: says nothing beside --{other}")
+    if options.quality is not None and options.seed is not None:
+        raise UserError("--seed: says nothing beside --quality")
+    if options.quality is None and options.ref_max_score is not None:
+        raise UserError("--ref-max-score: says nothing without --quality")
+
+
+def _of_run(options: Options) -> Demonstrators:
+    assert options.run is not None
+    seed = options.seed or 0
+    one = sources.policy(options.run, options.method, seed, options.n_demos)
+    if options.quality is None:
+        return demonstrators.of_seed(options.run, one, seed)
+    return demonstrators.of_quality(
+        options.run,
+        one,
+        options.n_demos,
+        options.quality,
+        options.episodes,
+        options.ref_max_score,
+    )
+
+
+def _of_function(options: Options) -> Demonstrators:
+    assert options.env is not None
     assert options.policy is not None
     module, _, function = options.policy.partition(":")
     try:

@@ -15,10 +15,10 @@ from typing import Annotated
 
 import tyro
 
-from cmedirl_jax.envs import split_id
 from cmedirl_jax.ranges import Size
-from cmedirl_jax.runs import command
 from cmedirl_jax.runs.config import RunConfig, StudyConfig, of_task
+from cmedirl_jax.runs.console.options import read_first
+from cmedirl_jax.runs.execute import execute
 from cmedirl_jax.runs.report.base import Report
 
 
@@ -28,7 +28,7 @@ class Options(RunConfig):
 
     Attributes:
         methods: Which methods to train: the paper's ddpg, hs-ddpg, me-ddpg and hs-me-ddpg, and
-            others, which a wrong name is answered by.
+            others, which a wrong name lists.
         out: Folder of the results; default results/TASK.
     """
 
@@ -49,15 +49,14 @@ def run(options: Options, arguments: Sequence[str]) -> int:
         options: what the arguments say.
         arguments: they tell a default number of demonstrations from one that is meant.
     """
-    fewer_will_do = _read_first(arguments).n_demos is None
-    return command.work("cmedirl", study(options), _report, fewer_will_do=fewer_will_do)
+    fewer_will_do = not _read_first(arguments).n_demos_given
+    return execute("cmedirl", study(options), _report, fewer_will_do=fewer_will_do)
 
 
 def study(options: Options) -> StudyConfig:
     """The run's whole configuration: the experts are the task's."""
     given = {each.name: getattr(options, each.name) for each in dataclasses.fields(RunConfig)}
-    _, name = split_id(options.env)
-    out = options.out or Path("results") / re.sub(r"[^\w.-]", "-", name)
+    out = options.out or Path("results") / re.sub(r"[^\w.-]", "-", options.env)
     return dataclasses.replace(of_task(options.env), **{**given, "out": out})
 
 
@@ -69,9 +68,4 @@ def _report(folder: Path) -> Report:
 
 
 def _read_first(arguments: Sequence[str]) -> argparse.Namespace:
-    # The task decides other defaults, which tyro needs; it reports a wrong one.
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--env", default=StudyConfig.env)
-    # A default number of demonstrations is no more than --demos holds; a number given is meant.
-    parser.add_argument("--n-demos", "--n_demos", nargs="*")
-    return parser.parse_known_args(list(arguments))[0]
+    return read_first(arguments, env=StudyConfig.env)

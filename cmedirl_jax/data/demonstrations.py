@@ -69,26 +69,29 @@ def keep(demonstrations: Demonstrations, kept: np.ndarray) -> Demonstrations:
 
     Args:
         demonstrations: the pool.
-        kept: `[E]` bool, which episodes stay, at least one. Of the metadata stay those that say
-            nothing of single episodes or experts, and the seeds.
+        kept: `[E]` bool, which episodes stay, at least one. Of the metadata stay the task, who
+            made it and its reference scores, and the seeds of these episodes.
 
     Raises:
-        ValueError: if none stays.
+        ValueError: if none stays, or for another shape.
+        TypeError: for another dtype.
     """
+    length = episodes(demonstrations).length
+    checks.shape("kept", kept, length.shape)
+    checks.kind("kept", kept, np.bool_)
     if not np.any(kept):
         raise ValueError(f"none of the {len(kept)} episodes stays")
-    length = episodes(demonstrations).length
     rows = np.repeat(kept, length)
     transition, truncated = jax.tree.map(
         lambda leaf: np.asarray(leaf)[rows], (demonstrations.transition, demonstrations.truncated)
     )
     number = np.arange(np.sum(kept), dtype=np.int32)
     known = demonstrations.metadata
-    metadata = {name: known[name] for name in ("env", *FACTS) if name in known}
-    if "seeds" in known:
-        metadata["seeds"] = [
-            seed for seed, stays in zip(known["seeds"], kept, strict=True) if stays
-        ]
+    # A description tells of all the episodes.
+    names = {"env", *FACTS} - {"description"}
+    metadata = {name: value for name, value in known.items() if name in names}
+    if isinstance(seeds := known.get("seeds"), list) and len(seeds) == len(kept):
+        metadata["seeds"] = [seed for seed, stays in zip(seeds, kept, strict=True) if stays]
     return Demonstrations(transition, truncated, np.repeat(number, length[kept]), metadata)
 
 

@@ -25,7 +25,6 @@ from cmedirl_jax.runs.console import screen
 from cmedirl_jax.runs.console.phases import phase
 from cmedirl_jax.runs.console.progress import Reporter, reporter, stepwise
 from cmedirl_jax.runs.console.signals import Interruption
-from cmedirl_jax.runs.loggers import base as loggers
 from cmedirl_jax.runs.loggers.background import Log
 from cmedirl_jax.runs.storage import cells, checkpoints, plain, tables
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
@@ -98,7 +97,7 @@ class Session(NamedTuple):
     def log(self, cell: Cell, pool: LearnersPool | None) -> Log:
         """Logs a cell, on process 0."""
         return Log(
-            self.plan.folder / loggers.FOLDER / cell.name,
+            self.plan.folder / run_folder.LOG / cell.name,
             self.plan.log if self.cluster.writer else (),
             cell.block,
             each_seed=self.plan.log_seeds,

@@ -1,31 +1,27 @@
 """From a configuration to a plan: everything that can be refused is refused before any work."""
 
 import dataclasses
-import hashlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from cmedirl_jax import checks, envs, networks, ranges
+from cmedirl_jax import envs, networks, ranges
 from cmedirl_jax.agents.exploration import ExplorationSettings
-from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
-from cmedirl_jax.data.formats.reading import Actions
 from cmedirl_jax.envs import Env, HostEnv
+from cmedirl_jax.runs import demonstrations as given
 from cmedirl_jax.runs.cells import pools
 from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.cells.record import Budget
 from cmedirl_jax.runs.cluster.base import ALONE, Cluster
-from cmedirl_jax.runs.config import DemosCheck, Experts, StudyConfig
+from cmedirl_jax.runs.config import Experts, StudyConfig
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.loggers import registry
 from cmedirl_jax.runs.storage import cells, plain
 from cmedirl_jax.tabular import imitation
-from cmedirl_jax.training import compose, needs
+from cmedirl_jax.training import compose
 from cmedirl_jax.training.compose import Algorithm
 from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.settings import Settings
@@ -88,7 +84,7 @@ class Plan(NamedTuple):
             raise UserError(
                 f"--out: {self.folder / 'demonstrations'}: {error}; give another folder"
             ) from error
-        _check_enough(self.asked, shared.data.episodes.start.shape[1])
+        given.check_enough(self.asked, shared.data.episodes.start.shape[1])
         return shared
 
 
@@ -107,16 +103,16 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool =
     path, demos = config.demos, None
     if path is not None:
         demos = cluster.pool_from_writer(
-            lambda: load_demonstrations(
+            lambda: given.load(
                 path, env, config.check_demos, config.demos_format, config.demos_actions
             )
         )
         assert demos is not None
-        _check_needs(config, demos)
-        held = _held(path, demos)
+        given.check_needs(config, demos)
+        held = given.held(path, demos)
         if fewer_will_do and held < max(config.n_demos):
             config = dataclasses.replace(config, n_demos=(held,))
-        _check_enough(cells.asked(config.methods, config.n_demos), held)
+        given.check_enough(cells.asked(config.methods, config.n_demos), held)
     return Plan(
         folder=config.folder,
         config=cluster.from_writer(lambda: describe(config, demos)),
@@ -142,12 +138,8 @@ def describe(config: StudyConfig, demos: Demonstrations | None = None) -> dict[s
     if config.demos is None:
         return described
     # Another file under the same name is another configuration.
-    if config.demos.is_file():
-        with config.demos.open("rb") as file:
-            described["demos_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
-    elif demos is not None:
-        leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(demos[:3])]
-        described["demos_sha256"] = hashlib.sha256(b"".join(leaves)).hexdigest()
+    if (digest := given.digest(config.demos, demos)) is not None:
+        described["demos_sha256"] = digest
     return described
 
 
@@ -202,7 +194,7 @@ def check(config: StudyConfig) -> Env | HostEnv:
     _check_parts(config, env, capacity)
     if config.demos is None:
         asked = cells.asked(config.methods, config.n_demos)
-        _check_enough(asked, config.resolved_experts.trajectories)
+        given.check_enough(asked, config.resolved_experts.trajectories)
     return env
 
 
@@ -284,77 +276,3 @@ def _check_epsilon(settings: ExplorationSettings) -> None:
     largest = factor * max(epsilon.epsilon_start, epsilon.epsilon_end)
     if settings.kind == "epsilon-greedy" and largest > 1.0:
         raise UserError(f"--exploration.hot-start-factor: makes epsilon {largest:g}, above 1")
-
-
-def load_demonstrations(
-    path: Path,
-    env: Env | HostEnv,
-    check: DemosCheck,
-    format: str | None = None,
-    actions: Actions = "refuse",
-) -> Demonstrations:
-    """Read what `--demos` names, and compute what it lacks where the task can.
-
-    Args:
-        path: the file, the folder, or the id of a dataset.
-        env: the task.
-        check: what is asked of the demonstrations, see `StudyConfig`.
-        format: a name in `demonstrations.FORMATS`; default by its looks.
-        actions: what happens to actions out of bounds.
-
-    Raises:
-        UserError: if it is missing, damaged or foreign.
-    """
-    try:
-        pool = demonstrations.parse(str(path), format, env.spec)
-    except (FileNotFoundError, ModuleNotFoundError, ValueError) as error:
-        raise UserError(f"--demos: {error}") from error
-    except OSError as error:
-        raise UserError(f"--demos: {path}: {error.strerror or error}") from error
-    if actions == "clip":
-        pool = demonstrations.clip(pool, env.spec)
-    try:
-        match check:
-            case "dynamics":
-                demonstrations.validate(pool, env.spec)
-                pool = demonstrations.complete(pool, env)
-                demonstrations.check(pool, env)
-            case "spec":
-                demonstrations.validate(pool, env.spec)
-            case "none":
-                checks.transition_shapes(
-                    env.spec, pool.transition, pool.episode.shape, "transition"
-                )
-    except ValueError as error:
-        raise UserError(f"--demos: {path}: {error}; see --check-demos") from error
-    # The tables have a column of each.
-    expert = pool.metadata.get("expert", "")
-    if not isinstance(expert, str):
-        raise UserError(f"--demos: {path}: expert in its metadata is {expert!r}, no text")
-    steps = pool.metadata.get("expert_env_steps", 0)
-    if type(steps) is not int or not 0 <= steps < 2**63:
-        raise UserError(f"--demos: {path}: expert_env_steps in its metadata is {steps!r}, no count")
-    return pool
-
-
-def _check_needs(config: StudyConfig, pool: Demonstrations) -> None:
-    """Refuse demonstrations that lack what a method reads."""
-    for name in config.methods:
-        try:
-            needs.check(METHODS[name], config.settings, demonstrations.absent(pool))
-        except ValueError as error:
-            raise UserError(f"--methods {name}: {error}") from error
-
-
-def _held(path: Path, pool: Demonstrations) -> int:
-    """How many demonstrations each learner may draw from."""
-    try:
-        return pools.held(pool)
-    except ValueError as error:
-        raise UserError(f"--demos: {path}: {error}") from error
-
-
-def _check_enough(asked: Sequence[tuple[str, int]], held: int) -> None:
-    most = max(n_demos for _, n_demos in asked)
-    if most > held:
-        raise UserError(f"--n-demos: {most} asked, the pool holds {held}")

@@ -60,6 +60,7 @@ def found(task: str) -> TaskSettings | None:
     """The same; None for a task without. Imports its module, which may add them."""
     module, name = split_id(task)
     if module:
-        with contextlib.suppress(ImportError):
+        # What is wrong with the module is said where the task is made.
+        with contextlib.suppress(Exception):
             importlib.import_module(module)
     return TASKS.get(task) or TASKS.get(name)

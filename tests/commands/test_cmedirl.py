@@ -42,6 +42,21 @@ def test_the_help_names_every_command(capsys):
             "--policy: a:b is no MODULE:FUN",
         ),
         ("demos record a.npz --run nowhere", "nowhere: holds no run"),
+        ("demos record a.npz --run x --env y", "--env: says nothing beside --run"),
+        (
+            "demos record a.npz --env Pendulum-v1 --policy a:b --seed 3",
+            "--seed: says nothing beside --policy",
+        ),
+        (
+            "demos record a.npz --run x --quality medium --seed 3",
+            "--seed: says nothing beside --quality",
+        ),
+        (
+            "demos record a.npz --run x --ref-max-score 3",
+            "--ref-max-score: says nothing without --quality",
+        ),
+        ("demos convert a.csv b.csv --env broken:X-v0", "--env: broken:X-v0 cannot be made"),
+        ("train --env broken:X-v0", "--env: broken:X-v0 cannot be made"),
         ("demos record a.npz --run x --episodes 0", "--episodes: must be at least 1, got 0"),
         ("demos template a.txt --env Pendulum-v1", "a.txt: give a name that ends in .csv or"),
         ("evaluate nowhere", "nowhere: holds no run"),
@@ -53,12 +68,26 @@ def test_the_help_names_every_command(capsys):
     ],
 )
 def test_a_mistake_is_a_line_and_code_2(arguments, line, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+    work, modules = tmp_path / "work", tmp_path / "modules"
+    for folder in (work, modules):
+        folder.mkdir()
+    (modules / "broken.py").write_text("raise RuntimeError('no such robot')")
+    monkeypatch.syspath_prepend(modules)
+    monkeypatch.chdir(work)
     assert cmedirl.main(arguments.split()) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"cmedirl: {line}")
     assert error.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
+    assert list(work.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["train --env", "demos inspect a.csv --env"])
+def test_a_missing_value_is_reported_in_tyros_form(command, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        cmedirl.main(command.split())
+    output = "".join(capsys.readouterr())
+    assert "--env" in output
+    assert "[--n-demos" not in output
 
 
 def test_it_is_installed_under_its_name():

@@ -52,4 +52,4 @@ def test_only_good_episodes_are_kept_if_asked(table, tmp_path, capsys):
     np.testing.assert_allclose(demonstrations.returns(pool), returns[returns >= least], rtol=1e-5)
     demonstrations.check(pool, pools.ENV)
     assert main([*command, "1000"]) == 2
-    assert "none of the 3 episodes stays" in capsys.readouterr().err
+    assert "--min-return: the best of 3 episodes returns" in capsys.readouterr().err

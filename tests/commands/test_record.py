@@ -6,6 +6,8 @@ import pytest
 from cmedirl_jax.commands import demonstrators
 from cmedirl_jax.commands.cmedirl import main
 from cmedirl_jax.data import demonstrations
+from cmedirl_jax.runs import load_policy
+from cmedirl_jax.runs.errors import UserError
 from tests.support import pools
 
 CAR = ["--env", pools.ENV.spec.id]
@@ -44,28 +46,46 @@ def test_record_plays_what_a_run_has_learned(untrained_run, tmp_path):
     ("quality", "learners"), [("expert", [2]), ("medium", [3]), ("mixed", [0, 1, 2, 3])]
 )
 def test_a_quality_chooses_learners_by_what_they_return(quality, learners):
-    returns = np.array([-20.0, 90.0, 94.0, 40.0])
+    returns = np.array([-20.0, 90.0, 94.0, 40.0, np.nan])
     assert demonstrators.chosen_of(returns, -33.0, 94.0, quality) == learners
+
+
+def test_no_learner_is_chosen_where_no_return_is_known():
+    with pytest.raises(UserError, match="no learner's return is known"):
+        demonstrators.chosen_of(np.array([np.nan]), -33.0, 94.0, "mixed")
 
 
 def test_a_dataset_says_who_acted_and_has_reference_scores(untrained_run, tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    name = "test/car/mixed-v0"
     of_run = ["--run", str(untrained_run), "--method", "ddpg", "--quality", "mixed"]
     facts = ["--author", "a", "--author-email", "b", "--code-permalink", "c"]
-    assert main(["demos", "record", name, *of_run, *facts, "--episodes", "2"]) == 0
-    known = minari.load_dataset(name).storage.metadata
-    assert known["algorithm_name"] == "ddpg"
-    assert known["ref_min_score"] == pytest.approx(-33.1, abs=0.5)
-    for line in (
-        "2 episodes, 1998 steps",
-        "ddpg, mixed: every learner of 2",
-        "this dataset scores",
-    ):
-        assert line in known["description"]
-    assert str(untrained_run.parent) not in known["description"]
-    # Untrained learners play in turn, and differently.
+    for count, learners in ((1, 1), (2, 2)):
+        name = f"test/car{count}/mixed-v0"
+        options = [*of_run, *facts, "--episodes", str(count), "--ref-max-score", "94"]
+        assert main(["demos", "record", name, *options]) == 0
+        known = minari.load_dataset(name).storage.metadata
+        assert known["algorithm_name"] == "ddpg"
+        assert known["ref_min_score"] == pytest.approx(-33.1, abs=0.5)
+        assert known["ref_max_score"] == 94.0
+        for line in (
+            f"{count} episodes, {999 * count} steps",
+            f"ddpg, mixed: {learners} learners in turn of the 2",
+            "this dataset scores",
+        ):
+            assert line in known["description"]
+        assert str(untrained_run.parent) not in known["description"]
+    # Learner i plays episode i, from the reset seed i.
     pool = demonstrations.read(name, env=pools.ENV)
-    actions = np.asarray(pool.transition.action).reshape(2, 999)
-    assert not np.allclose(*actions)
+    for seed in (0, 1):
+        first = np.asarray(pool.episode) == seed
+        act = load_policy(untrained_run, "ddpg", seed)
+        seen, done = (np.asarray(x)[first] for x in pool.transition[:2])
+        np.testing.assert_allclose(act(seen), done, atol=1e-5)
+
+
+def test_an_expert_no_better_than_random_actions_is_refused(untrained_run, tmp_path, capsys):
+    of_run = ["--run", str(untrained_run), "--method", "ddpg", "--quality", "expert"]
+    command = ["demos", "record", str(tmp_path / "a.npz"), *of_run, "--ref-max-score", "-50"]
+    assert main(command) == 2
+    assert "--quality: the expert returns -50 and random actions -33" in capsys.readouterr().err

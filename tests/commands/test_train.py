@@ -34,7 +34,10 @@ def test_it_leaves_a_report_without_the_papers_claims_and_a_reward(run):
     there = {path.name for path in run.iterdir() if not path.name.startswith(".")}
     assert {"summary.csv", "report.html", "figures", "cells", "evaluations.parquet"} <= there
     assert "claims.md" not in there
-    assert "claims" not in (run / "report.html").read_text()
+    page = (run / "report.html").read_text()
+    assert "claims" not in page
+    assert "MountainCarContinuous-v0: me-ddpg" in page
+    assert "demonstrations: pool.npz" in page
     observation, action = np.zeros(2, np.float32), np.zeros(1, np.float32)
     assert np.isfinite(load_reward(run, "me-ddpg", seed=1)(observation, action))
     # Three demonstrations are all there are.
@@ -51,6 +54,13 @@ def test_the_same_command_does_nothing_to_a_finished_run(run, monkeypatch, capsy
     assert "holds a run with --agent.tau 0.01, not 0.02" in capsys.readouterr().err
 
 
+def test_verdicts_of_another_command_do_not_stay_beside_its_report(run, monkeypatch):
+    monkeypatch.chdir(run.parents[1])
+    (run / "claims.md").write_text("verdicts")
+    assert main(["train", "--demos", "pool.npz", *SMALL]) == 0
+    assert not (run / "claims.md").exists()
+
+
 def test_other_commands_find_the_only_method(run, capsys):
     assert main(["evaluate", str(run), "--starts", "2"]) == 0
     assert "over 2 starts" in capsys.readouterr().out
@@ -63,4 +73,7 @@ def test_a_task_brings_its_settings_and_its_experts_and_options_come_first():
     study = train.study(options)
     assert study.experts.settings == found.experts
     assert str(study.out) == "results/Pendulum-v1"
-    assert str(train.study(train.Options(env="my.tasks:a/Dock-v0")).out) == "results/a-Dock-v0"
+    assert (
+        str(train.study(train.Options(env="my.tasks:a/Dock-v0")).out)
+        == "results/my.tasks-a-Dock-v0"
+    )

@@ -176,7 +176,15 @@ def test_discounts_of_returns_are_between_0_and_1(discount):
 @given(lengths=pools.episode_lengths, data=st.data())
 def test_kept_episodes_are_those_of_the_pool_in_its_order(lengths, data):
     pool = pools.random_pool(lengths)
-    pool = pool._replace(metadata={"env": "A-v0", "seeds": list(range(len(lengths))), "other": 1})
+    pool = pool._replace(
+        metadata={
+            "env": "A-v0",
+            "seeds": list(range(len(lengths))),
+            "author": "me",
+            "description": "ten episodes",
+            "other": 1,
+        }
+    )
     kept = np.array(
         data.draw(st.lists(st.booleans(), min_size=len(lengths), max_size=len(lengths)))
     )
@@ -189,7 +197,20 @@ def test_kept_episodes_are_those_of_the_pool_in_its_order(lengths, data):
     np.testing.assert_array_equal(found.transition.observation, pool.transition.observation[rows])
     np.testing.assert_array_equal(found.truncated, pool.truncated[rows])
     np.testing.assert_array_equal(demonstrations.episodes(found).length, np.array(lengths)[kept])
-    assert found.metadata == {"env": "A-v0", "seeds": np.flatnonzero(kept).tolist()}
+    seeds = np.flatnonzero(kept).tolist()
+    assert found.metadata == {"env": "A-v0", "seeds": seeds, "author": "me"}
     # Every episode kept: the same pool.
     every = demonstrations.keep(pool, np.ones(len(lengths), bool))
     chex.assert_trees_all_equal(every[:3], pool[:3])
+
+
+@pytest.mark.parametrize(
+    ("kept", "error", "match"),
+    [
+        (np.array([True, False]), ValueError, "kept"),
+        (np.array([1, 0, 1]), TypeError, "kept"),
+    ],
+)
+def test_masks_of_another_kind_are_refused(kept, error, match):
+    with pytest.raises(error, match=match):
+        demonstrations.keep(pools.random_pool([2, 3, 1]), kept)

@@ -20,11 +20,13 @@ def test_one_command_makes_every_dataset_and_a_table_of_them(tmp_path, monkeypat
     assert table["episodes"].to_list() == [2, 2, 2]
     assert sorted(minari.list_local_datasets()) == names
     # What is there stays.
-    capsys.readouterr()
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "minari").rglob("*.hdf5")}
     assert datasets.main(command) == 0
-    output = capsys.readouterr()
-    assert "recorded" not in output.out
-    assert output.err == ""
+    assert {path: path.stat().st_mtime_ns for path in files} == files
+    assert len(files) == 3
+    capsys.readouterr()
+    assert datasets.main([*command, "--episodes", "5"]) == 2
+    assert "--episodes: test/car/expert-v0 is there and has 2" in capsys.readouterr().err
 
 
 def test_a_table_elsewhere_is_refused_before_the_work(tmp_path, capsys):

@@ -1,7 +1,6 @@
 import polars as pl
 import pytest
 
-from cmedirl_jax.runs import command
 from experiments import variants
 from experiments.variants import VARIANTS, Variant
 from tests.support import curves
@@ -54,10 +53,10 @@ def test_the_options_of_a_variant_are_run_grids(variant, monkeypatch):
     def ending_with(code):
         return lambda _, config, *args, **options: parsed.append(config.settings) or code
 
-    monkeypatch.setattr(command, "work", ending_with(3))
+    monkeypatch.setattr("experiments.run_grid.execute", ending_with(3))
     code = variants.main(["--demos", "pool.npz", "--only", variant.name])
     assert code == 3
-    monkeypatch.setattr(command, "work", ending_with(0))
+    monkeypatch.setattr("experiments.run_grid.execute", ending_with(0))
     monkeypatch.setattr(variants, "compare", lambda *_: pl.DataFrame())
     monkeypatch.setattr(variants, "shown", lambda table: "")
     assert variants.main(["--demos", "pool.npz", "--only", variant.name]) == 0

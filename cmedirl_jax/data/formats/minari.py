@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -116,6 +117,7 @@ def to_minari(
     """
     import minari  # type: ignore[import-not-found]
     from minari.data_collector.episode_buffer import EpisodeBuffer  # type: ignore[import-not-found]
+    from minari.storage import get_dataset_path  # type: ignore[import-not-found]
 
     if not ID.fullmatch(str(dataset_id)):
         raise ValueError(f"{dataset_id}: Minari's ids are (namespace/)(name/)name-vN")
@@ -138,14 +140,22 @@ def to_minari(
         name: _space(np.asarray(getattr(demonstrations.transition, name)), spec, name)
         for name in ("observation", "action")
     }
-    return minari.create_dataset_from_buffers(
-        dataset_id,
-        buffers,
-        env=env,
-        observation_space=box_of["observation"],
-        action_space=box_of["action"],
-        **{"eval_env": env, **facts},
-    )
+    folder = get_dataset_path(dataset_id)
+    was_there = folder.exists()
+    try:
+        return minari.create_dataset_from_buffers(
+            dataset_id,
+            buffers,
+            env=env,
+            observation_space=box_of["observation"],
+            action_space=box_of["action"],
+            **{"eval_env": env, **facts},
+        )
+    except Exception:
+        # Minari leaves what it had begun, which would block the name.
+        if not was_there:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def _buffer(own: dict[str, np.ndarray]) -> dict[str, Any]:

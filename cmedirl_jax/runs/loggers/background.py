@@ -58,10 +58,12 @@ class Log:
             self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._outlets:
             self._evaluations.put(None)
-            self._thread.join()
+            # Whoever stops a run at once does not wait for a slow disk.
+            at_once = kind is not None and issubclass(kind, KeyboardInterrupt)
+            self._thread.join(1.0 if at_once else None)
 
     def follow(self, evaluations: Sequence[EvaluationRows]) -> None:
         """Log the evaluations that are new since the last call; returns at once.

@@ -4,9 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-FOLDER = "log"
-"""In a run's folder: `log/CELL` holds what all loggers write of a cell."""
-
 
 class Point(NamedTuple):
     """The scalars of a series at one environment step; all are finite."""
@@ -31,13 +28,11 @@ class Logger(NamedTuple):
     """A kind of log.
 
     Attributes:
-        description: what it writes, in a few words.
         open: `(folder, series, config) -> Writer`. The folder `log/CELL` is named as the cell is,
             and holds nothing of this logger yet; `series` is the file's or the run's name within
             it, and `config` the run's configuration as JSON values.
         package: the module that it imports when it is opened, of the extra `log`; None for none.
     """
 
-    description: str
     open: Callable[[Path, str, Mapping[str, Any]], Writer]
     package: str | None = None

@@ -37,4 +37,4 @@ def _open(folder: Path, series: str, config: Mapping[str, Any]) -> _Writer:
     return _Writer(folder / "csv" / f"{series}.csv")
 
 
-CSV = Logger("a CSV file for each series", _open)
+CSV = Logger(_open)

@@ -1,6 +1,6 @@
 """The loggers by name."""
 
-import importlib.util
+import importlib.metadata
 from collections.abc import Iterable
 
 from cmedirl_jax.registries import Registry
@@ -20,10 +20,13 @@ def check(names: Iterable[str]) -> None:
         ValueError: naming the first that is not.
     """
     for name in names:
-        if name not in LOGGERS:
-            raise ValueError(f"unknown logger {name!r}; there are {', '.join(LOGGERS)}")
         package = LOGGERS[name].package
-        if package is not None and importlib.util.find_spec(package) is None:
+        try:
+            # A folder of that name would pass for a module.
+            version = package and importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            version = None
+        if package is not None and version is None:
             raise ValueError(
                 f"{package} is not installed: python -m pip install 'cmedirl-jax[log]'"
             )

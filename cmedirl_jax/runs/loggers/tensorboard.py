@@ -50,4 +50,4 @@ def _open(folder: Path, series: str, config: Mapping[str, Any]) -> _Writer:
     return _Writer(folder / "tensorboard" / series)
 
 
-TENSORBOARD = Logger("TensorBoard's event files", _open, package="tensorboard")
+TENSORBOARD = Logger(_open, package="tensorboard")

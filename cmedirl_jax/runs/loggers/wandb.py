@@ -50,4 +50,4 @@ def _open(folder: Path, series: str, config: Mapping[str, Any]) -> _Writer:
     return _Writer(run)
 
 
-WANDB = Logger("Weights & Biases, offline", _open, package="wandb")
+WANDB = Logger(_open, package="wandb")

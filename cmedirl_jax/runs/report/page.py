@@ -74,14 +74,14 @@ def page(
         by_episodes: whether all seeds end at one episode, rather than at one step.
         verdicts: HTML that stands before the results.
     """
-    title = f"{config['env']}, {config['preset']}"
+    title = f"{config['env']}: {', '.join(config['methods'])}"
     budget = f"{config['max_steps']:,} environment steps" if config["max_steps"] else ""
     if config["max_episodes"]:
         budget = f"{config['max_episodes']} episodes"
     parts = [
         f"<h1>{_text(title)}</h1>",
         f"<p>{config['seeds']} seeds of each row, {budget} each; study seed {config['seed']}; "
-        f"demonstrators: {_text(config['expert'])}. Brackets are 95% intervals.</p>",
+        f"demonstrations: {_text(_demonstrations(config))}. Brackets are 95% intervals.</p>",
         verdicts,
         "<h2>Results</h2>",
         _results(summary, by_episodes),
@@ -95,6 +95,12 @@ def page(
         + "\n".join(part for part in parts if part)
         + "\n</body></html>\n"
     )
+
+
+def _demonstrations(config: Mapping[str, Any]) -> str:
+    if not any(METHODS[method].uses_demonstrations for method in config["methods"]):
+        return "none"
+    return config["demos"] or f"of experts that were trained first ({config['expert']})"
 
 
 def _text(value: object) -> str:

@@ -47,17 +47,13 @@ def write(
     outputs.write(path, content)
 
     # Figures.
+    by_episodes = ends.episodes is not None
     files = figures.files(folder / "figures", summary)
-    wrong = []
-    if redraw or not all(file.exists() for of_figure in files.values() for file in of_figure):
-        figures.draw(
-            folder / "figures",
-            run.tables,
-            summary,
-            run.threshold,
-            wrong.append,
-            by_episodes=ends.episodes is not None,
-        )
+    there = all(file.exists() for of_figure in files.values() for file in of_figure)
+    wrong: list[str] = []
+    if redraw or not there:
+        to, tell = folder / "figures", wrong.append
+        figures.draw(to, run.tables, summary, run.threshold, tell, by_episodes=by_episodes)
 
     # Verdicts and page.
     whole = summary["seeds"].to_list() == [config["seeds"]] * _asked(config)
@@ -65,12 +61,14 @@ def write(
     if judge is not None and whole and config["seeds"] > 1 and not ends.mixed:
         verdicts = judge(run)
         outputs.write(folder / "claims.md", verdicts.markdown.encode())
+    else:
+        (folder / "claims.md").unlink(missing_ok=True)
     text = page.page(
         config,
         summary,
         {name: of_figure[0] for name, of_figure in files.items()},
         written["versions"],
-        by_episodes=ends.episodes is not None,
+        by_episodes=by_episodes,
         verdicts="" if verdicts is None else verdicts.html,
     )
     outputs.write(folder / "report.html", text.encode())

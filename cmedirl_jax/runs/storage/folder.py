@@ -15,7 +15,6 @@ from cmedirl_jax import envs
 from cmedirl_jax.io import atomic
 from cmedirl_jax.runs import numerics
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.loggers import base as loggers
 from cmedirl_jax.runs.storage import cells, checkpoints, outputs, sealing
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 
@@ -23,9 +22,11 @@ PACKAGES = (
     *("cmedirl-jax", "jax", "jaxlib", "flax", "optax"),
     *("chex", "gymnasium", "numpy", "orbax-checkpoint"),
 )
+LOG = "log"
+"""`log/CELL` holds what all loggers write of a cell."""
 FOLDERS = (
     *(stored_demonstrations.FOLDER, checkpoints.FOLDER, cells.FOLDER),
-    *("figures", loggers.FOLDER),
+    *("figures", LOG),
 )
 FILES = (
     *("config.json", "summary.csv", "claims.md", "report.html"),

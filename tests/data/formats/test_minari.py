@@ -107,3 +107,14 @@ def test_what_a_pool_lacks_is_not_made_up(name):
         each[f"{name}s"] = None
     with pytest.raises(ValueError, match=f"Minari's datasets have {name}s, this pool has none"):
         demonstrations.to_minari(as_pool(trajectories), "test/lacking-v0", spec=SPEC)
+
+
+def test_a_dataset_that_cannot_be_written_leaves_nothing(monkeypatch):
+    pytest.importorskip("minari")
+    from minari import storage
+
+    facts = {**FACTS, "eval_env": "No-v0"}
+    with pytest.raises(gymnasium.error.Error):
+        demonstrations.to_minari(as_pool(episodes()), "test/broken-v0", spec=SPEC, **facts)
+    assert not storage.get_dataset_path("test/broken-v0").exists()
+    demonstrations.to_minari(as_pool(episodes()), "test/broken-v0", spec=SPEC, **FACTS)

@@ -40,7 +40,7 @@ class Faulty:
 @pytest.fixture
 def logger(monkeypatch):
     def add(writer):
-        monkeypatch.setitem(LOGGERS, "mine", Logger("mine", writer.open))
+        monkeypatch.setitem(LOGGERS, "mine", Logger(writer.open))
         return writer
 
     return add

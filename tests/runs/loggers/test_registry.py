@@ -1,4 +1,4 @@
-import importlib.util
+import importlib.metadata
 
 import pytest
 
@@ -7,14 +7,17 @@ from cmedirl_jax.runs.loggers import registry
 
 def test_unknown_loggers_are_refused_by_name():
     with pytest.raises(
-        ValueError, match=r"^unknown logger 'x'; there are csv, tensorboard, wandb$"
+        ValueError, match=r"^unknown logger 'x'; there are: csv, tensorboard, wandb$"
     ):
         registry.check(["csv", "x"])
 
 
 @pytest.mark.parametrize("name", ["tensorboard", "wandb"])
 def test_a_logger_whose_package_is_missing_is_refused_before_the_run(name, monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda package: None)
+    def missing(package):
+        raise importlib.metadata.PackageNotFoundError(package)
+
+    monkeypatch.setattr(importlib.metadata, "version", missing)
     registry.check(["csv"])
     expected = rf"^{name} is not installed: python -m pip install 'cmedirl-jax\[log\]'$"
     with pytest.raises(ValueError, match=expected):

@@ -7,7 +7,7 @@ from rich import box
 from rich.table import Table
 
 
-def table(summary: pl.DataFrame) -> Table:
+def of(summary: pl.DataFrame) -> Table:
     """The summary as a paper would print it."""
     title = f"{summary['seeds'].max()} seeds per row; 95% intervals"
     if summary["experts"].max() == 1:

@@ -10,7 +10,7 @@ from cmedirl_jax.runs import run as run_lib
 from cmedirl_jax.runs import start, validation
 from cmedirl_jax.runs.cells import pools
 from cmedirl_jax.runs.config import StudyConfig
-from cmedirl_jax.runs.console import compile_cache, screen, signals, streams, summary
+from cmedirl_jax.runs.console import compile_cache, screen, signals, streams, summary_table
 from cmedirl_jax.runs.errors import Interrupted, UserError
 from cmedirl_jax.runs.report.base import Report
 from cmedirl_jax.runs.storage import plain
@@ -23,7 +23,7 @@ _OF_A_PROCESS = ("out", "coordinator", "process_id")
 """The options in which the processes of one run may differ."""
 
 
-def work(
+def execute(
     program: str,
     config: StudyConfig,
     report: Callable[[Path], Report],
@@ -74,14 +74,14 @@ def _say_what_was_assumed(
     if tasks.found(config.env) is None:
         said = f"{config.env} has no settings of its own: the car's, see docs/tasks.md"
         screen.say(console, said)
-    if n_demos_assumed and plan.demos is not None:
+    if n_demos_assumed and plan.demos is not None and any(n_demos for _, n_demos in plan.asked):
         held, drawn = pools.held(plan.demos), plan.subset_size
-        share = "has them all" if drawn == held else f"draws {drawn} of them"
-        screen.say(console, f"{config.demos} holds {held} demonstrations, and each learner {share}")
+        share = f"all {held}" if drawn == held else f"{drawn} of {held}"
+        screen.say(console, f"{config.demos}: each learner has {share} demonstrations")
 
 
 def _print(console: Console, concluded: Report, plan: Plan) -> None:
-    screen.show(console, summary.table(concluded.summary))
+    screen.show(console, summary_table.of(concluded.summary))
     difference = concluded.summary["gymnasium_difference_max"].max()
     if difference is None and isinstance(plan.env, Env):
         console.print("No episode was repeated in Gymnasium's own copy of the task: it has none")
