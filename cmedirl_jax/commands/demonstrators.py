@@ -137,8 +137,7 @@ def datasheet(pool: Demonstrations, spec: EnvSpec) -> str:
         "",
         f"- {len(length)} episodes, {int(length.sum())} steps; {int(length.min())} to "
         f"{int(length.max())} steps an episode; the task ended {ended}, the time limit the others",
-        f"- returns {returns.mean():.4g} ± {returns.std():.2g}, from {returns.min():.4g} to "
-        f"{returns.max():.4g}",
+        f"- returns {sources.spread(returns)}, from {returns.min():.4g} to {returns.max():.4g}",
     ]
     if "ref_max_score" in known:
         worst, best = known["ref_min_score"], known["ref_max_score"]

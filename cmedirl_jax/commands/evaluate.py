@@ -35,7 +35,7 @@ def run(options: Options) -> int:
     found = rollouts(sources.task(policy.task), policy.act, options.starts)
     screen.say(
         screen.console(),
-        f"return {np.mean(found.episode_return):.4g} ± {np.std(found.episode_return):.2g} over "
+        f"{policy.method}, seed {options.seed}: return {sources.spread(found.episode_return)} over "
         f"{options.starts} starts; {np.mean(found.length):.4g} steps; the task ended "
         f"{np.mean(found.terminated):.0%} of the episodes",
     )

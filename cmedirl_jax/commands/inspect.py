@@ -56,8 +56,8 @@ def run(options: Options) -> int:
     ends = int(np.sum(pool.transition.terminated)), int(np.sum(pool.truncated))
     screen.say(
         console,
-        f"{len(length)} episodes, {len(pool.episode)} steps; the task ended {ends[0]}, something "
-        f"else {ends[1]}",
+        f"{len(length)} episodes, {len(pool.episode)} steps; the task ended {ends[0]}, a time "
+        f"limit or whoever recorded them {ends[1]}",
     )
     for name in demonstrations.absent(pool):
         screen.say(console, f"There are no {name}s")
@@ -67,7 +67,7 @@ def run(options: Options) -> int:
 
     # What is wrong with it.
     if env is not None:
-        screen.say(console, wrong or f"Every step is one of {env.spec.id}")
+        screen.say(console, wrong or _right(pool, env))
     if options.picture is not None:
         drawing.save(
             lambda: _figure(pool, env),
@@ -86,6 +86,16 @@ def _wrong(pool: Demonstrations, env: Env | HostEnv | None) -> str | None:
     except ValueError as error:
         return str(error)
     return None
+
+
+def _right(pool: Demonstrations, env: Env | HostEnv) -> str:
+    """What was found right."""
+    if demonstrations.can_be_repeated(pool, env):
+        return f"Every step is one of {env.spec.id}"
+    return (
+        f"Bounds and the order of steps are those of {env.spec.id}; successors and rewards were "
+        "not compared: the task cannot be set to an observation, or there are no actions"
+    )
 
 
 def _short(value: object) -> str:
@@ -129,7 +139,9 @@ def _figure(pool: Demonstrations, env: Env | HostEnv | None) -> drawing.Figure:
     figure = drawing.Figure(figsize=(9, 2.4 * rows), layout="constrained")
     axes = list(figure.subplots(rows, 3, squeeze=False).flat)
     for place, (name, values, _) in zip(axes, columns, strict=False):
-        place.hist(values, bins=40)
+        # A constant would be drawn on an axis of roundings.
+        spread = (values.min(), values.max()) if np.ptp(values) else (values[0] - 1, values[0] + 1)
+        place.hist(values, bins=40, range=spread)
         place.set_xlabel(name)
         place.set_ylabel("episodes" if name in ("length", "return") else "steps")
     for place in axes[len(columns) :]:

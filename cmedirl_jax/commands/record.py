@@ -86,8 +86,8 @@ def run(options: Options) -> int:
     )
     convert.write(options.out, pool, env.spec)
     returns = demonstrations.returns(pool)
-    spread = f"{returns.mean():.4g} ± {returns.std():.2g}"
-    screen.say(screen.console(), f"{options.out}: {len(returns)} episodes, returns {spread}")
+    said = f"{options.out}: {len(returns)} episodes, returns {sources.spread(returns)}"
+    screen.say(screen.console(), said)
     return 0
 
 

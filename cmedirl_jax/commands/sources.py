@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import jax
+import numpy as np
 import tyro
 
 from cmedirl_jax import envs
@@ -65,6 +66,11 @@ def policy(run: Path, method: str | None, seed: int, n_demos: int | None) -> Pol
         raise UserError(" ".join(str(error).split())) from error
 
 
+def spread(returns: np.ndarray) -> str:
+    """Returns in words: their mean and standard deviation."""
+    return f"{np.mean(returns):.4g} ± {np.std(returns):.3g}"
+
+
 def task(name: str) -> Env | HostEnv:
     """The task of this name.
 
@@ -86,4 +92,4 @@ def pool(source: str, format: str | None, env: Env | HostEnv | None) -> Demonstr
     try:
         return demonstrations.parse(source, format, None if env is None else env.spec)
     except (FileNotFoundError, ModuleNotFoundError, ValueError) as error:
-        raise UserError(" ".join(str(error).split())) from error
+        raise UserError(f"{' '.join(str(error).split())} (--env, --format)") from error

@@ -20,6 +20,8 @@ from cmedirl_jax.runs.config import RunConfig, StudyConfig, of_task
 from cmedirl_jax.runs.console.options import read_first
 from cmedirl_jax.runs.execute import execute
 from cmedirl_jax.runs.report.base import Report
+from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.training.methods import METHODS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,8 +29,8 @@ class Options(RunConfig):
     """What to train. A task brings a budget and settings of its own, where it has some.
 
     Attributes:
-        methods: Which methods to train: the paper's ddpg, hs-ddpg, me-ddpg and hs-me-ddpg, and
-            others, which a wrong name lists.
+        methods: Which methods to train, beside those that the folder holds already: the paper's
+            ddpg, hs-ddpg, me-ddpg and hs-me-ddpg, and others, which a wrong name lists.
         out: Folder of the results; default results/TASK.
     """
 
@@ -57,7 +59,18 @@ def study(options: Options) -> StudyConfig:
     """The run's whole configuration: the experts are the task's."""
     given = {each.name: getattr(options, each.name) for each in dataclasses.fields(RunConfig)}
     out = options.out or Path("results") / re.sub(r"[^\w.-]", "-", options.env)
-    return dataclasses.replace(of_task(options.env), **{**given, "out": out})
+    # The tables keep the methods that the folder holds already.
+    methods = dict.fromkeys((*_methods_in(out), *options.methods))
+    return dataclasses.replace(
+        of_task(options.env), **{**given, "out": out, "methods": tuple(methods)}
+    )
+
+
+def _methods_in(folder: Path) -> list[str]:
+    if not (folder / "config.json").is_file():
+        return []
+    methods = run_folder.read(folder)["config"].get("methods", [])
+    return [method for method in methods if method in METHODS]
 
 
 def _report(folder: Path) -> Report:

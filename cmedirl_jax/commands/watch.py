@@ -6,6 +6,7 @@ Example: cmedirl watch results/tuned --method hs-me-ddpg --seed 3 --out car.gif
 import dataclasses
 import io
 import os
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -48,11 +49,15 @@ def run(options: Options) -> int:
     """Run the command; returns its exit code."""
     if not options.window:
         outputs.check("out", options.out)
+        if options.out.suffix != ".gif":
+            raise UserError(f"--out: {options.out} does not end in .gif")
     policy = sources.policy(options.folder, options.method, options.seed, options.n_demos)
     mode = "human" if options.window else "rgb_array"
     if not options.window:
         # Frames are drawn in memory: no screen is looked for.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        if sys.platform == "linux" and "DISPLAY" not in os.environ:
+            os.environ.setdefault("MUJOCO_GL", "egl")
     frames = of_episode(jax.jit(policy.act), policy.task, options.reset_seed, options.every, mode)
     if not options.window:
         outputs.write(options.out, gif(frames, options.width))
@@ -86,8 +91,9 @@ def of_episode(
             if ended or steps % every == 0:
                 frames.append(env.render())
         env.close()
-    except (gymnasium.error.Error, TypeError) as error:
-        reason = " ".join(str(error).split())
+    # Simulators and the libraries that they draw with raise what they like.
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise UserError(f"{task}: Gymnasium cannot draw it ({reason})") from error
     return frames
 

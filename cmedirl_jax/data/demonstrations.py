@@ -18,7 +18,7 @@ from cmedirl_jax.data.completion import clip, complete
 from cmedirl_jax.data.formats import FORMATS, load, parse, read, save
 from cmedirl_jax.data.formats.minari import FACTS, from_minari, to_minari
 from cmedirl_jax.data.trajectories import from_trajectories
-from cmedirl_jax.data.validation import absent, check, validate
+from cmedirl_jax.data.validation import absent, can_be_repeated, check, validate
 from cmedirl_jax.types import Demonstrations, DemonstrationSubset, Numeric, Transition
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "Demonstrations",
     "absent",
     "at",
+    "can_be_repeated",
     "check",
     "clip",
     "complete",

@@ -131,6 +131,12 @@ def _validate_continuity(arrays: dict[str, np.ndarray]) -> None:
         )
 
 
+def can_be_repeated(demonstrations: Demonstrations, env: Env | HostEnv) -> bool:
+    """Whether `check` compares each step with the task's own, and not just bounds and order."""
+    settable = isinstance(env, Env) and env.state_at is not None
+    return settable and "action" not in absent(demonstrations)
+
+
 def check(demonstrations: Demonstrations, env: Env | HostEnv, params: Any = None) -> None:
     """Check a pool as `validate` does, and each of its steps against the task's own.
 
@@ -150,8 +156,7 @@ def check(demonstrations: Demonstrations, env: Env | HostEnv, params: Any = None
             the step, the field, its value, the task's value and the tolerance.
     """
     validate(demonstrations, env.spec)
-    lacking = absent(demonstrations)
-    if isinstance(env, HostEnv) or env.state_at is None or "action" in lacking:
+    if isinstance(env, HostEnv) or not can_be_repeated(demonstrations, env):
         return
     made = jax.tree.map(np.asarray, demonstrations.transition)
     found = np.column_stack([made.next_observation, made.reward, made.terminated])

@@ -137,7 +137,10 @@ def _find(
     except UserError as error:
         raise ValueError(str(error)) from error
     if not finished:
-        raise ValueError(f"{run}: holds no finished cell of a run")
+        raise ValueError(
+            f"{run}: holds no finished cell of a run; a run that was stopped goes on by the same "
+            "command"
+        )
 
     def matches(cell: SavedCell) -> bool:
         key = cell.key

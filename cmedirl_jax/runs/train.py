@@ -210,8 +210,9 @@ def _note_scale(session: Session, pool: Demonstrations) -> float:
         return found._asdict()
 
     found = scale.Scale(**session.cluster.from_writer(measure))
+    who = "best expert" if plan.demos is None else "demonstrations"
     session.console.print(
-        f"Returns: random actions {found.random:.4g}, best expert {_known(found.expert)}, solved "
+        f"Returns: random actions {found.random:.4g}, {who} {_known(found.expert)}, solved "
         f"from {found.solved:.4g}. Rewards of a step spread by {found.reward_spread_random:.2g} in "
         f"random episodes, {_known(found.reward_spread_demonstrated)} in demonstrated ones",
         highlight=False,

@@ -23,7 +23,7 @@ def test_inspect_counts_what_is_there_and_draws_it(table, tmp_path, capsys):
     assert main(["demos", "inspect", str(table), *CAR, "--picture", str(picture)]) == 0
     output = capsys.readouterr().out
     pool = pools.scripted(3)
-    assert f"3 episodes, {len(pool.episode)} steps; the task ended 3, something else 0" in output
+    assert f"3 episodes, {len(pool.episode)} steps; the task ended 3, a time limit" in output
     assert "Every step is one of MountainCarContinuous-v0" in output
     rows = {line.split()[0]: line.split()[1:] for line in output.splitlines() if line.split()}
     returns = demonstrations.returns(pool)

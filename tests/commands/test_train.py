@@ -1,5 +1,6 @@
 """A run on one's own demonstrations by the installed command."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -52,6 +53,14 @@ def test_the_same_command_does_nothing_to_a_finished_run(run, monkeypatch, capsy
     assert "[1/1]" not in capsys.readouterr().out
     assert main(["train", "--demos", "pool.npz", *SMALL, "--agent.tau", "0.02"]) == 2
     assert "holds a run with --agent.tau 0.01, not 0.02" in capsys.readouterr().err
+
+
+def test_a_second_method_joins_the_first_in_the_tables(run, monkeypatch, capsys):
+    monkeypatch.chdir(run.parents[1])
+    options = train.Options(methods=("ddpg", "me-ddpg"), seeds=2)
+    assert train.study(options).methods == ("me-ddpg", "ddpg")
+    # Elsewhere there is nothing yet.
+    assert train.study(dataclasses.replace(options, out=run / "new")).methods == options.methods
 
 
 def test_verdicts_of_another_command_do_not_stay_beside_its_report(run, monkeypatch):

@@ -39,6 +39,7 @@ def test_a_gif_holds_every_frame():
         (["nowhere"], "nowhere: holds no run"),
         (["{run}", "--method", "gail"], "holds no method gail"),
         (["{run}", "--method", "hs-ddpg"], "holds several of hs-ddpg, seed 0; give one of"),
+        (["{run}", "--out", "car.mp4"], "--out: car.mp4 does not end in .gif"),
         (["{run}", "--every", "0"], "--every: must be at least 1, got 0"),
     ],
 )

@@ -27,6 +27,4 @@ def check(names: Iterable[str]) -> None:
         except importlib.metadata.PackageNotFoundError:
             version = None
         if package is not None and version is None:
-            raise ValueError(
-                f"{package} is not installed: python -m pip install 'cmedirl-jax[log]'"
-            )
+            raise ValueError(f"{package} is not installed: python -m pip install {package}")

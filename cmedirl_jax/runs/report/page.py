@@ -58,6 +58,7 @@ _EPISODES = ("convergence_episode_median", "episodes to solve, median", "{:,.0f}
 def page(
     config: Mapping[str, Any],
     summary: pl.DataFrame,
+    threshold: float,
     figures: Mapping[str, Path],
     versions: Mapping[str, str],
     *,
@@ -69,6 +70,7 @@ def page(
     Args:
         config: the run's configuration.
         summary: a row for each cell.
+        threshold: return that counts as solved.
         figures: PNG files by their names in `CAPTIONS`; those that are gone are left out.
         versions: of the packages that made the run.
         by_episodes: whether all seeds end at one episode, rather than at one step.
@@ -81,7 +83,8 @@ def page(
     parts = [
         f"<h1>{_text(title)}</h1>",
         f"<p>{config['seeds']} seeds of each row, {budget} each; study seed {config['seed']}; "
-        f"demonstrations: {_text(_demonstrations(config))}. Brackets are 95% intervals.</p>",
+        f"demonstrations: {_text(_demonstrations(config))}. Solved: a mean return of "
+        f"{threshold:.4g} at an evaluation. Brackets are 95% intervals.</p>",
         verdicts,
         "<h2>Results</h2>",
         _results(summary, by_episodes),
@@ -117,7 +120,7 @@ def _results(summary: pl.DataFrame, by_episodes: bool) -> str:
         *(label for _, label, _ in columns),
         "best policy, its evaluation",
         "the same, fresh starts",
-        "its expert",
+        "its demonstrators",
     ]
     rows = ["<tr>" + "".join(f"<th>{_text(head)}</th>" for head in heads) + "</tr>"]
     for row in summary.iter_rows(named=True):
@@ -130,7 +133,7 @@ def _results(summary: pl.DataFrame, by_episodes: bool) -> str:
         ]
         cells += [_interval(row, column, form) for column, _, form in columns]
         cells += [
-            f'<td class="number">{_number(row[column], "{:.2f}")}</td>'
+            f'<td class="number">{_number(row[column], "{:.2f}", "-")}</td>'
             for column in ("best_evaluation_mean", "best_return_mean", "expert_return_mean")
         ]
         rows.append(f"<tr>{''.join(cells)}</tr>")
@@ -145,8 +148,8 @@ def _interval(row: Mapping[str, Any], column: str, form: str) -> str:
     return f'<td class="number">{_number(value, form)}<small>{bounds}</small></td>'
 
 
-def _number(value: float | None, form: str) -> str:
-    return "?" if value is None else form.format(value)
+def _number(value: float | None, form: str, unknown: str = "?") -> str:
+    return unknown if value is None else form.format(value)
 
 
 def _figure(name: str, path: Path) -> str:
@@ -170,7 +173,10 @@ def _made(config: Mapping[str, Any], versions: Mapping[str, str]) -> str:
     made = ", ".join(f"{name} {version}" for name, version in versions.items())
     # Where the results lie is no setting.
     settings = run_folder.flat({**config, "out": None})
-    lines = "\n".join(f"{name}: {value}" for name, value in settings.items() if name != "out")
+    left_out = ("out", "expert") if config["demos"] else ("out",)
+    lines = "\n".join(
+        f"{name}: {value}" for name, value in settings.items() if not name.startswith(left_out)
+    )
     return (
         f"<h2>What was run</h2><p>{_text(made)}</p><details><summary>every setting</summary>"
         f"<pre>{_text(lines)}</pre></details>"

@@ -66,6 +66,7 @@ def write(
     text = page.page(
         config,
         summary,
+        run.threshold,
         {name: of_figure[0] for name, of_figure in files.items()},
         written["versions"],
         by_episodes=by_episodes,

@@ -19,6 +19,6 @@ def test_a_logger_whose_package_is_missing_is_refused_before_the_run(name, monke
 
     monkeypatch.setattr(importlib.metadata, "version", missing)
     registry.check(["csv"])
-    expected = rf"^{name} is not installed: python -m pip install 'cmedirl-jax\[log\]'$"
+    expected = rf"^{name} is not installed: python -m pip install {name}$"
     with pytest.raises(ValueError, match=expected):
         registry.check(["csv", name])

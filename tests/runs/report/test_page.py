@@ -60,10 +60,10 @@ def read(text):
 def test_the_page_shows_verdicts_results_and_figures(summary, tmp_path):
     picture = tmp_path / "figure3.png"
     picture.write_bytes(b"abc")
-    text = page.page(CONFIG, summary, {"figure3": picture}, {"jax": "1.2"}, verdicts=VERDICTS)
+    text = page.page(CONFIG, summary, 90.0, {"figure3": picture}, {"jax": "1.2"}, verdicts=VERDICTS)
     reader = read(text)
     shown = " ".join(reader.shown)
-    for line in ("Verdicts", "jax 1.2"):
+    for line in ("Verdicts", "jax 1.2", "Solved: a mean return of 90 at"):
         assert line in shown
     assert "hs-ddpg (N_T 5)" in shown
     assert "[0.29, 1.00]" in shown
@@ -71,14 +71,14 @@ def test_the_page_shows_verdicts_results_and_figures(summary, tmp_path):
 
 
 def test_the_page_loads_nothing_and_runs_nothing(summary, tmp_path):
-    text = page.page(CONFIG, summary, {}, {})
+    text = page.page(CONFIG, summary, 90.0, {}, {})
     assert "<script" not in text
     assert "http" not in text
 
 
 def test_a_run_over_episodes_is_told_in_episodes(summary):
     config = CONFIG | {"max_steps": None, "max_episodes": 30}
-    shown = " ".join(read(page.page(config, summary, {}, {}, by_episodes=True)).shown)
+    shown = " ".join(read(page.page(config, summary, 90.0, {}, {}, by_episodes=True)).shown)
     assert "30 episodes each" in shown
     assert "episodes to solve, median" in shown
     assert "steps to solve" not in shown
@@ -86,11 +86,11 @@ def test_a_run_over_episodes_is_told_in_episodes(summary):
 
 def test_without_verdicts_or_figures_there_is_still_a_page(summary, tmp_path):
     gone = {"figure3": tmp_path / "gone.png"}
-    reader = read(page.page(CONFIG, summary, gone, {}))
+    reader = read(page.page(CONFIG, summary, 90.0, gone, {}))
     assert reader.loaded == []
     assert "Verdicts" not in reader.shown
 
 
 def test_the_page_does_not_say_where_the_run_lies(summary):
     config = CONFIG | {"out": "/somewhere/else"}
-    assert "/somewhere" not in page.page(config, summary, {}, {})
+    assert "/somewhere" not in page.page(config, summary, 90.0, {}, {})
