@@ -141,9 +141,11 @@ def _figure(pool: Demonstrations, env: Env | HostEnv | None) -> drawing.Figure:
     for place, (name, values, _) in zip(axes, columns, strict=False):
         # A constant would be drawn on an axis of roundings.
         spread = (values.min(), values.max()) if np.ptp(values) else (values[0] - 1, values[0] + 1)
-        place.hist(values, bins=40, range=spread)
+        of_episodes = name in ("length", "return")
+        # Most steps look alike where a policy holds still: the others are seen on a log scale.
+        place.hist(values, bins=40, range=spread, log=not of_episodes)
         place.set_xlabel(name)
-        place.set_ylabel("episodes" if name in ("length", "return") else "steps")
+        place.set_ylabel("episodes" if of_episodes else "steps")
     for place in axes[len(columns) :]:
         place.set_visible(False)
     return figure
