@@ -2,10 +2,14 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from cmedirl_jax.assess.distances import Coverage, Successor
 from cmedirl_jax.envs import Env
 from cmedirl_jax.types import Transition
+
+OVERSAMPLING = 4
+"""Draws for each observation in which the episode is to go on."""
 
 
 def successor(env: Env) -> Successor:
@@ -26,7 +30,9 @@ def successor(env: Env) -> Successor:
 
 
 def uniform(key: jax.Array, env: Env, count: int, draws: int) -> Coverage:
-    """Observations and actions drawn uniformly within their bounds, and their successors.
+    """Observations and actions spread over their bounds, and their successors.
+
+    No observation is that of an episode's end, of which rewards are never asked.
 
     Args:
         key: randomness.
@@ -39,29 +45,46 @@ def uniform(key: jax.Array, env: Env, count: int, draws: int) -> Coverage:
     """
     spec, follow = env.spec, successor(env)
     bounds = (spec.observation_low, spec.observation_high)
-    if not all(bool(jnp.isfinite(bound).all()) for bound in bounds):
+    if not all(np.isfinite(bound).all() for bound in bounds):
         raise ValueError(f"{spec.id}: its observations have no finite bounds to draw within")
     keys = jax.random.split(key, 5)
-
-    def observations(key: jax.Array, count: int) -> jax.Array:
-        drawn = jax.random.uniform(key, (count, spec.observation_dim), jnp.float32, *bounds)
-        # Observations of one state may be bound to each other, as a cosine and a sine are.
-        idle = jnp.zeros((count, spec.action_dim), jnp.float32)
-        return jax.vmap(follow)(drawn, idle)
-
-    def actions(key: jax.Array, count: int) -> jax.Array:
-        shape = (count, spec.action_dim)
-        return jax.random.uniform(key, shape, jnp.float32, spec.action_low, spec.action_high)
-
-    observation, action = observations(keys[0], count), actions(keys[1], count)
+    observation, action = _live(keys[0], env, count), _actions(keys[1], env, count)
     return Coverage(
         observation,
         action,
         jax.vmap(follow)(observation, action),
-        actions(keys[2], draws),
-        observations(keys[3], draws),
-        observations(keys[4], draws),
+        _actions(keys[2], env, draws),
+        _live(keys[3], env, draws),
+        _live(keys[4], env, draws),
     )
+
+
+def _actions(key: jax.Array, env: Env, count: int) -> jax.Array:
+    low, high = env.spec.action_low, env.spec.action_high
+    return jax.random.uniform(key, (count, env.spec.action_dim), jnp.float32, low, high)
+
+
+def _live(key: jax.Array, env: Env, count: int) -> jax.Array:
+    """Observations in which an episode goes on: successors of uniform draws that did not end it.
+
+    A step also makes observations of a state that draws are not, such as a cosine and a sine.
+    """
+    assert env.state_at is not None
+    state_at, params, spec = env.state_at, env.default_params, env.spec
+    keys = jax.random.split(key)
+    shape = (OVERSAMPLING * count, spec.observation_dim)
+    bounds = spec.observation_low, spec.observation_high
+    drawn = jax.random.uniform(keys[0], shape, jnp.float32, *bounds)
+
+    def step(observation: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        state = state_at(observation, params)
+        answer = env.step(jax.random.key(0), state, action, params)[1]
+        return answer.observation, answer.terminated
+
+    after, ended = jax.vmap(step)(drawn, _actions(keys[1], env, len(drawn)))
+    # Those that go on come first; were they fewer than asked for, they would be taken again.
+    going_on = jnp.maximum(jnp.sum(~ended), 1)
+    return after[jnp.argsort(ended, stable=True)[jnp.arange(count) % going_on]]
 
 
 def visited(key: jax.Array, transition: Transition, count: int, draws: int) -> Coverage:

@@ -5,8 +5,8 @@
 
 A canonical form takes out of a reward what changes no policy's rank: potential-based shaping (Ng et
 al. 1999). The distance between two forms is blind to their scales and, by Pearson's correlation, to
-constants. The papers' tasks do not end; a reward is asked about steps after the end of an episode
-as about any other.
+constants. EPIC and DARD know no end of an episode: a constant counts as nothing, even where it
+makes never arriving the best policy. STARC on a grid with an absorbing state tells.
 """
 
 from collections.abc import Callable
@@ -118,8 +118,8 @@ def starc(dynamics: Dynamics, reward: jax.Array, discount: Numeric) -> jax.Array
 
     C(s, a) = R(s, a) - V(s) + gamma E[V(S')]
 
-    with V the value of the policy that takes every action alike. Constants need no centring: it
-    takes them out.
+    with V the value of the policy that takes every action alike. Where a state is absorbing, a
+    constant decides whether it is worth reaching, and is no equivalence.
 
     Args:
         dynamics: P(s'|s,a); an absorbing state leads to itself, and its rewards are 0.
@@ -143,12 +143,22 @@ def starc(dynamics: Dynamics, reward: jax.Array, discount: Numeric) -> jax.Array
     return forms.reshape(jnp.shape(reward))
 
 
-def normalised(canonical: Array, other: Array) -> jax.Array:
+def normalised(canonical: Array, other: Array, counted: Array | None = None) -> jax.Array:
     """Half the length of the difference of canonical forms `[..., S, A]`, each of length 1.
 
     A form of zeros, that of a reward that prefers nothing, is unrelated to all others.
+
+    Args:
+        canonical: a form.
+        other: another one.
+        counted: `[S]` bool, the states that count; default all.
     """
-    ours, theirs = (jnp.reshape(x, (*jnp.shape(x)[:-2], -1)) for x in (canonical, other))
+    count = jnp.shape(canonical)[-2]
+    kept = jnp.ones(count, bool) if counted is None else jnp.asarray(counted)
+    ours, theirs = (
+        jnp.reshape(jnp.where(kept[:, None], x, 0.0), (*jnp.shape(x)[:-2], -1))
+        for x in (canonical, other)
+    )
     return _distance(ours, theirs)
 
 

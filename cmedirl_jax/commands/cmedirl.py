@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from cmedirl_jax import ranges
-from cmedirl_jax.commands import convert, evaluate, inspect, record, template, train, watch
+from cmedirl_jax.commands import convert, evaluate, inspect, record, reward, template, train, watch
 from cmedirl_jax.runs.console import ending
 from cmedirl_jax.runs.errors import UserError
 
@@ -35,6 +35,7 @@ _RUNS = {
     template.Options: template.run,
     evaluate.Options: evaluate.run,
     watch.Options: watch.run,
+    reward.Options: reward.run,
 }
 
 
@@ -65,10 +66,12 @@ def _commands(arguments: Sequence[str]) -> Any:
     default = train.default(arguments) if arguments[:1] == ["train"] else train.Options()
     of_train = tyro.conf.subcommand("train", default=default, description=train.__doc__)
     of_evaluate = tyro.conf.subcommand("evaluate", description=evaluate.__doc__)
+    of_reward = tyro.conf.subcommand("reward", description=reward.__doc__)
     of_watch = tyro.conf.subcommand("watch", description=watch.__doc__)
     return (
         Annotated[train.Options, of_train]
         | Annotated[evaluate.Options, of_evaluate]
         | Annotated[watch.Options, of_watch]
+        | Annotated[reward.Options, of_reward]
         | Annotated[DemosOptions, tyro.conf.subcommand("demos")]
     )

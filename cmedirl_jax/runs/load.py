@@ -25,8 +25,25 @@ from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.types import EnvSpec
 
 
-class _Learned(NamedTuple):
-    """A cell, and the task, method and settings of its policies and rewards."""
+class Functions(NamedTuple):
+    """One function with parameters for each seed of a cell.
+
+    Attributes:
+        function: `(params of one seed, *arguments)`.
+        params: leaves `[seeds, ...]`.
+    """
+
+    function: Callable[..., jax.Array]
+    params: Any
+
+    def of(self, index: int) -> Callable[..., jax.Array]:
+        """The function of one seed, which converts its arguments to arrays."""
+        params = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), self.params)
+        return lambda *arguments: self.function(params, *map(jnp.asarray, arguments))
+
+
+class LearnedCell(NamedTuple):
+    """What a cell has learned, with the task, method and settings that it learned with."""
 
     cell: SavedCell
     task: EnvSpec
@@ -38,15 +55,57 @@ class _Learned(NamedTuple):
         """Whether the method has no networks: its policies and rewards are tables on a grid."""
         return self.method.tabular is not None and not self.method.interacts
 
-    def parameters(self, name: str, one: Any, seed: int) -> Any:
-        """One seed's parameters, of the folder `name`; `one` has their structure and shapes."""
-        key = self.cell.key
+    def policies(self) -> Functions:
+        """Each seed's best policy, `(actor, observation [..., O]) -> action [..., A]`."""
+        if self.only_tables:
+            env = envs.make(self.task.id)
+            # Only the grids of the discretised task are needed, which no computation gives.
+            mdp = jax.eval_shape(lambda: imitation.discretised(env, self.settings.tabular))
+            return Functions(
+                lambda table, observation: discretise.greedy(mdp, table)(observation),
+                self._saved("policies", mdp.reward),
+            )
+        made = networks.make(self.task, self.settings.architecture)
+        return Functions(
+            lambda actor, observation: networks.policy(made, actor, observation),
+            self._saved("policies", _abstract(made.actor.init)),
+        )
+
+    def rewards(self) -> Functions:
+        """Each seed's last reward, `(params, observation [..., O], action [..., A]) -> [...]`.
+
+        Raises:
+            ValueError: if the method has no reward of its own.
+        """
+        if not (self.cell.path / "rewards").exists():
+            raise ValueError(f"{self.method.name} learns no reward")
+        if self.only_tables:
+            states, actions = imitation.grids(self.task, self.settings.tabular)
+            learner = table_reward.make(states, actions, self.settings.reward)
+            # The last row is the absorbing state's, which no observation is in.
+            whole = jax.ShapeDtypeStruct((states.size + 1, actions.size), jnp.float32)
+            params = self._saved("rewards", whole)[:, :-1]
+        else:
+            steps = self.task.max_episode_steps
+            made = compose.compose(self.task, self.method, self.settings, steps)
+            assert made.learner is not None
+            learner = made.learner
+            params = self._saved("rewards", _abstract(learner.init).params)
+        state = learner.init(jax.random.key(0))
+        return Functions(
+            lambda params, observation, action: learner.reward(
+                state.replace(params=params), observation, action
+            ),
+            params,
+        )
+
+    def _saved(self, name: str, one: Any) -> Any:
+        """The parameters `[seeds, ...]` of a folder; `one` has one seed's structure and shapes."""
 
         def of_cell(leaf: Any) -> jax.ShapeDtypeStruct:
-            return jax.ShapeDtypeStruct((key.seeds, *leaf.shape), leaf.dtype)
+            return jax.ShapeDtypeStruct((self.cell.key.seeds, *leaf.shape), leaf.dtype)
 
-        every = checkpoint.load(self.cell.path / name, jax.tree.map(of_cell, one))
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf[seed - key.first_seed]), every)
+        return checkpoint.load(self.cell.path / name, jax.tree.map(of_cell, one))
 
 
 def load_policy(
@@ -70,16 +129,7 @@ def load_policy(
         OSError: if a file cannot be read.
     """
     learned = _find(run, method, seed, n_demos, study)
-    task, settings = learned.task, learned.settings
-    if learned.only_tables:
-        env = envs.make(task.id)
-        # Only the grids of the discretised task are needed, which no computation gives.
-        mdp = jax.eval_shape(lambda: imitation.discretised(env, settings.tabular))
-        table = learned.parameters("policies", mdp.reward, seed)
-        return discretise.greedy(mdp, table)
-    made = networks.make(task, settings.architecture)
-    actor = learned.parameters("policies", _abstract(made.actor.init), seed)
-    return lambda observation: networks.policy(made, actor, jnp.asarray(observation))
+    return learned.policies().of(seed - learned.cell.key.first_seed)
 
 
 def load_reward(
@@ -104,24 +154,11 @@ def load_reward(
         OSError: if a file cannot be read.
     """
     learned = _find(run, method, seed, n_demos, study)
-    task, settings = learned.task, learned.settings
-    if not (learned.cell.path / "rewards").exists():
-        raise ValueError(f"{run}: {method} learns no reward")
-    if learned.only_tables:
-        states, actions = imitation.grids(task, settings.tabular)
-        learner = table_reward.make(states, actions, settings.reward)
-        # The last row is the absorbing state's, which no observation is in.
-        whole = jax.ShapeDtypeStruct((states.size + 1, actions.size), jnp.float32)
-        params = learned.parameters("rewards", whole, seed)[:-1]
-    else:
-        made = compose.compose(task, learned.method, settings, task.max_episode_steps)
-        assert made.learner is not None
-        learner = made.learner
-        params = learned.parameters("rewards", _abstract(learner.init).params, seed)
-    state = learner.init(jax.random.key(0)).replace(params=params)
-    return lambda observation, action: learner.reward(
-        state, jnp.asarray(observation), jnp.asarray(action)
-    )
+    try:
+        rewards = learned.rewards()
+    except ValueError as error:
+        raise ValueError(f"{run}: {error}") from error
+    return rewards.of(seed - learned.cell.key.first_seed)
 
 
 def _abstract(init: Callable[[jax.Array], Any]) -> Any:
@@ -131,16 +168,8 @@ def _abstract(init: Callable[[jax.Array], Any]) -> Any:
 
 def _find(
     run: str | Path, method: str, seed: int, n_demos: int | None, study: int | None
-) -> _Learned:
-    try:
-        finished = cells.finished(Path(run))
-    except UserError as error:
-        raise ValueError(str(error)) from error
-    if not finished:
-        raise ValueError(
-            f"{run}: holds no finished cell of a run; a run that was stopped goes on by the same "
-            "command"
-        )
+) -> LearnedCell:
+    finished = _finished(run)
 
     def matches(cell: SavedCell) -> bool:
         key = cell.key
@@ -161,9 +190,34 @@ def _find(
             _words(n_demos=cell.key.n_demos, study=cell.key.study) for cell in matching
         )
         raise ValueError(f"{run}: holds several of {method}, seed {seed}; give one of: {choices}")
-    (cell,) = matching
+    return _learned(matching[0])
+
+
+def learned_cells(run: str | Path) -> list[LearnedCell]:
+    """What each finished cell of a run has learned.
+
+    Raises:
+        ValueError: if there is none, or a file is damaged or of another version.
+    """
+    return [_learned(cell) for cell in _finished(run)]
+
+
+def _finished(run: str | Path) -> list[SavedCell]:
     try:
-        return _Learned(cell, cell.task(), METHODS[method], cell.settings())
+        finished = cells.finished(Path(run))
+    except UserError as error:
+        raise ValueError(str(error)) from error
+    if not finished:
+        raise ValueError(
+            f"{run}: holds no finished cell of a run; a run that was stopped goes on by the same "
+            "command"
+        )
+    return finished
+
+
+def _learned(cell: SavedCell) -> LearnedCell:
+    try:
+        return LearnedCell(cell, cell.task(), METHODS[cell.key.method], cell.settings())
     except (LookupError, ValueError, TypeError) as error:
         raise ValueError(f"{cell.path}: {error}") from error
 

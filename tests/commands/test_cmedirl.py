@@ -9,7 +9,7 @@ from cmedirl_jax.commands import cmedirl, entry
 
 COMMANDS = (
     *("demos inspect", "demos convert", "demos record", "demos template"),
-    *("train", "evaluate", "watch"),
+    *("train", "evaluate", "watch", "reward"),
 )
 
 
@@ -60,6 +60,7 @@ def test_the_help_names_every_command(capsys):
         ("demos record a.npz --run x --episodes 0", "--episodes: must be at least 1, got 0"),
         ("demos template a.txt --env Pendulum-v1", "a.txt: give a name that ends in .csv or"),
         ("evaluate nowhere", "nowhere: holds no run"),
+        ("reward nowhere", "nowhere: holds no run"),
         ("evaluate x --starts 0", "--starts: must be at least 1, got 0"),
         ("train --method ppo", "--methods: unknown method 'ppo'; there are ddpg, hs-ddpg,"),
         ("train --env No-v0", "--env: unknown environment 'No-v0'; there are: "),

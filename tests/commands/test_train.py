@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 
+import polars as pl
 import pytest
 
 from cmedirl_jax.commands import train
@@ -54,6 +55,20 @@ def test_the_tutorials_last_program_prints_the_reward(run, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("angle speed | policy")
     assert len(lines) == 6
+
+
+def test_the_rewards_card_has_an_interval_for_each_measure(run, capsys):
+    assert main(["reward", str(run)]) == 0
+    output = capsys.readouterr().out
+    assert "auc: how often a demonstrated step is paid more" in output
+    summary = pl.read_csv(run / "reward" / "summary.csv")
+    measures = {"epic_uniform", "epic_visited", "dard_uniform", "dard_visited", "correlation"}
+    # Every demonstration was the learners' to see, no end pays, and three observations are no grid.
+    assert set(summary["measure"]) == measures | {"auc", "largest", "discrepancy", "wasserstein"}
+    assert (summary["low"] <= summary["mean"]).all()
+    assert (summary["mean"] <= summary["high"]).all()
+    rows = pl.read_parquet(run / "reward" / "seeds.parquet")
+    assert rows["seed"].to_list() == [0, 1]
 
 
 def test_the_same_command_does_nothing_to_a_finished_run(run, capsys):

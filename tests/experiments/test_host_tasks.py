@@ -1,6 +1,8 @@
 """The command on somebody else's task of Gymnasium."""
 
+import contextlib
 import dataclasses
+import io
 import json
 import re
 from pathlib import Path
@@ -37,7 +39,9 @@ def few_fresh_starts():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "dock"
-    assert run_grid.main([*SMALL, *METHODS, "--out", str(folder)]) == 0
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert run_grid.main([*SMALL, *METHODS, "--out", str(folder)]) == 0
+    (folder.parent / "said.txt").write_text(said.getvalue())
     return folder
 
 
@@ -164,10 +168,8 @@ def test_experts_of_a_task_without_settings_train_as_its_learners_do():
     assert paper.resolved_experts.settings == tasks.TaskSettings().experts
 
 
-def test_what_the_run_says_of_its_settings_and_experts(capsys, tmp_path):
-    command = [*SMALL, "--methods", "bc", "--out", str(tmp_path / "run")]
-    assert run_grid.main(command) == 0
-    output = " ".join(capsys.readouterr().out.split())
+def test_what_the_run_says_of_its_settings_and_experts(run):
+    output = " ".join((run.parent / "said.txt").read_text().split())
     assert "Dock-v0 has no settings of its own: the car's, see docs/tasks.md" in output
     assert re.search(r"\d of 3 experts solve the task; \d demonstrate for 3 learners", output)
     assert "No episode was repeated" not in output

@@ -118,7 +118,7 @@ def _check_against_the_tables(folder):
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        ("--log x", "--log: unknown logger 'x'; there are csv, tensorboard, wandb"),
+        ("--log x", "--log: unknown logger 'x'; there are: csv, tensorboard, wandb"),
         ("--log csv csv", "--log: give each once"),
         ("--log-seeds", "--log-seeds: there is no --log"),
     ],

@@ -24,9 +24,11 @@ PACKAGES = (
 )
 LOG = "log"
 """`log/CELL` holds what all loggers write of a cell."""
+REWARD = "reward"
+"""What `cmedirl reward` says of the rewards."""
 FOLDERS = (
     *(stored_demonstrations.FOLDER, checkpoints.FOLDER, cells.FOLDER),
-    *("figures", LOG),
+    *("figures", LOG, REWARD),
 )
 FILES = (
     *("config.json", "summary.csv", "claims.md", "report.html"),

@@ -1,0 +1,223 @@
+"""Report cards of the rewards that a run has learned: what each knows of the true reward."""
+
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import polars as pl
+
+from cmedirl_jax import envs, normalisation
+from cmedirl_jax.assess import card, coverage
+from cmedirl_jax.assess.card import Rewards
+from cmedirl_jax.data.demonstrations import Demonstrations
+from cmedirl_jax.envs import Env, HostEnv
+from cmedirl_jax.runs import intervals
+from cmedirl_jax.runs.drawing import Figure
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.load import LearnedCell, learned_cells
+from cmedirl_jax.runs.report import reward_maps, reward_samples
+from cmedirl_jax.runs.report.reward_samples import Context, Sampled
+from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
+from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.tabular import discretise
+from cmedirl_jax.types import Transition
+
+COMPARED = 256
+"""Transitions that rewards are compared on, and draws that their canonical forms average over."""
+SHOWN = 16
+"""Steps of each seed that are drawn."""
+GRID = {1: 201, 2: 51}
+"""Points along each dimension of one or two observations; more have no grid."""
+ACTIONS = 11
+MEASURES = {
+    "epic_uniform": "EPIC distance to r_e over the whole space (0: the same, 0.71: unrelated)",
+    "epic_visited": "EPIC distance to r_e where demonstrations and policies go",
+    "dard_uniform": "DARD distance to r_e over the whole space",
+    "dard_visited": "DARD distance to r_e where demonstrations and policies go",
+    "starc": "STARC distance to r_e on a grid",
+    "correlation": "correlation with r_e where demonstrations and policies go",
+    "advantage": "correlation with the optimum's advantage on a grid",
+    "auc": "how often a demonstrated step is paid more than one of the policy (AUC)",
+    "auc_held_out": "the same for demonstrations that the learner could not see",
+    "largest": "largest r_D of these steps",
+    "loitering": "the same as a share of the reward above which never ending pays",
+    "discrepancy": "maximum mean discrepancy of demonstrations and policy",
+    "wasserstein": "their sliced Wasserstein distance",
+}
+"""What is measured, in words."""
+
+
+class Cards(NamedTuple):
+    """What is said of a run's rewards.
+
+    Attributes:
+        rows: a row for each reward: method, n_demos, seed and the measures; null where there is
+            none.
+        maps: draws the rewards of the largest number of demonstrations; None for a task that cannot
+            be drawn.
+    """
+
+    rows: pl.DataFrame
+    maps: Callable[[], Figure] | None
+
+
+def of_run(folder: Path) -> Cards:
+    """The report cards of a run's rewards.
+
+    Raises:
+        UserError: if the folder holds no run, or one without demonstrations or rewards.
+    """
+    written = run_folder.read(folder)
+    config = written["config"]
+    pool = stored_demonstrations.load(folder)
+    if pool is None:
+        raise UserError(f"{folder}: the run has no demonstrations to assess a reward by")
+    try:
+        env, learned = envs.find(config["env"]), learned_cells(folder)
+    except (LookupError, ValueError) as error:
+        raise UserError(" ".join(str(error).split())) from error
+    rewarded = [cell for cell in learned if (cell.cell.path / "rewards").exists()]
+    if not rewarded:
+        raise UserError(f"{folder}: none of its methods learns a reward")
+    discount = config["settings"]["agent"]["discount"]
+    learners = max(cell.cell.key.seed_range.stop for cell in rewarded)
+    context = Context(env, pool, discount, learners, jax.random.key(config["seed"]))
+    sampled = [reward_samples.of_cell(context, cell) for cell in rewarded]
+    rows = [_of_cell(context, *each) for each in zip(rewarded, sampled, strict=True)]
+    most = max(cell.cell.key.n_demos for cell in rewarded)
+    shown = {
+        cell.method.name: reward_maps.Learned(
+            cell.rewards(), *(each.observation[:, :SHOWN].reshape(-1, 2) for each in one.seen)
+        )
+        for cell, one in zip(rewarded, sampled, strict=True)
+        if cell.cell.key.n_demos in (0, most) and reward_maps.fits(env)
+    }
+    return Cards(
+        pl.concat(rows, how="diagonal"),
+        functools.partial(reward_maps.maps, env, discount, shown) if shown else None,  # type: ignore[arg-type]
+    )
+
+
+def _of_cell(context: Context, learned: LearnedCell, sampled: Sampled) -> pl.DataFrame:
+    """The rows of a cell."""
+    key = learned.cell.key
+    rewards, columns = Rewards(*learned.rewards()), {}
+    # Against demonstrations.
+    told = jax.jit(lambda params: card.told(Rewards(rewards.reward, params), *sampled.seen))
+    columns |= {name: x for name, x in told(rewards.params)._asdict().items() if name != "smallest"}
+    if sampled.held_out is not None:
+        unseen = (sampled.held_out, sampled.seen[1])
+        again = jax.jit(lambda params: card.told(Rewards(rewards.reward, params), *unseen))
+        columns["auc_held_out"] = again(rewards.params).auc
+    bonus = _bonus(context.pool)
+    if bonus is not None:
+        columns["loitering"] = columns["largest"] / card.loitering(context.discount, bonus)
+    scale = _half_widths(context.env)
+    columns |= jax.jit(functools.partial(card.occupancies, context.key, scale))(
+        *(jax.tree.map(lambda leaf: leaf[:, :COMPARED], each) for each in sampled.seen)
+    )._asdict()
+    # Against the task's own reward.
+    if isinstance(context.env, Env) and context.env.state_at is not None:
+        columns |= _against_truth(context, context.env, rewards, sampled)
+    return pl.DataFrame(
+        {
+            "method": [key.method] * key.seeds,
+            "n_demos": [key.n_demos] * key.seeds,
+            "seed": list(key.seed_range),
+            **{name: np.asarray(columns[name], np.float64) for name in MEASURES if name in columns},
+        }
+    )
+
+
+def _bonus(pool: Demonstrations) -> float | None:
+    """What the task pays at its end, where that is a bonus."""
+    ends = np.asarray(pool.transition.reward)[np.asarray(pool.transition.terminated)]
+    known = ends[np.isfinite(ends)]
+    return float(known.max()) if known.size and known.max() > 0 else None
+
+
+def _half_widths(env: Env | HostEnv) -> np.ndarray:
+    """`[O + A]`; 1 where a bound is infinite."""
+    spec = env.spec
+    low = np.concatenate([spec.observation_low, spec.action_low])
+    high = np.concatenate([spec.observation_high, spec.action_high])
+    half = (high.astype(np.float64) - low) / 2.0
+    return np.where(np.isfinite(half) & (half < normalisation.SENSIBLE), half, 1.0)
+
+
+def _against_truth(
+    context: Context, env: Env, rewards: Rewards, sampled: Sampled
+) -> dict[str, Any]:
+    columns: dict[str, Any] = {}
+    visited = jax.tree.map(
+        lambda *leaves: np.concatenate([leaf.reshape(-1, *leaf.shape[2:]) for leaf in leaves]),
+        *sampled.seen,
+    )
+    for name, made in _coverages(context, env, visited):
+        found = jax.jit(
+            lambda params, made=made: card.truth(
+                Rewards(rewards.reward, params), env, made, context.discount
+            )
+        )(rewards.params)
+        columns |= {f"epic_{name}": found.epic, f"dard_{name}": found.dard}
+        columns["correlation"] = found.correlation
+    points = GRID.get(env.spec.observation_dim)
+    if points is not None and np.isfinite(env.spec.observation_high).all():
+        mdp = jax.jit(
+            lambda: discretise.make(
+                env, (points,) * env.spec.observation_dim, (ACTIONS,) * env.spec.action_dim
+            )
+        )()
+        found = jax.jit(
+            lambda params: card.on_grid(Rewards(rewards.reward, params), mdp, context.discount)
+        )(rewards.params)
+        columns |= found._asdict()
+    return columns
+
+
+def _coverages(
+    context: Context, env: Env, visited: Transition
+) -> Iterator[tuple[str, coverage.Coverage]]:
+    """The coverage distributions by name; the visited one comes last."""
+    if np.isfinite(env.spec.observation_high).all():
+        yield (
+            "uniform",
+            jax.jit(lambda key: coverage.uniform(key, env, COMPARED, COMPARED))(context.key),
+        )
+    yield "visited", coverage.visited(context.key, visited, COMPARED, COMPARED)
+
+
+def summarise(rows: pl.DataFrame, seeds: pl.DataFrame) -> pl.DataFrame:
+    """The mean of each measure over the seeds of each cell, with its 95% interval.
+
+    Args:
+        rows: as `of_run` gives them.
+        seeds: the run's table, whose `expert_id` says which seeds share an expert.
+    """
+    shared = ["method", "n_demos", "seed"]
+    rows = rows.join(seeds.select(*shared, "expert_id"), on=shared, how="left")
+    found = []
+    for (method, n_demos), cell in rows.group_by("method", "n_demos", maintain_order=True):
+        experts = cell["expert_id"]
+        for measure in MEASURES:
+            if measure not in cell.columns or cell[measure].null_count():
+                continue
+            interval = intervals.mean(
+                cell[measure].to_numpy(),
+                clusters=None if experts.null_count() else experts.to_numpy(),
+            )
+            found.append(
+                {
+                    "method": method,
+                    "n_demos": n_demos,
+                    "measure": measure,
+                    "seeds": cell.height,
+                    "mean": interval.estimate,
+                    "low": interval.low,
+                    "high": interval.high,
+                }
+            )
+    return pl.DataFrame(found)

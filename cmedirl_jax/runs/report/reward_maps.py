@@ -1,0 +1,133 @@
+"""Pictures of learned rewards over a task's two observations, beside the task's own."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cmedirl_jax.envs import Env
+from cmedirl_jax.runs.drawing import Axes, Figure
+from cmedirl_jax.runs.load import Functions
+from cmedirl_jax.runs.report import curves
+from cmedirl_jax.tabular import discretise, interpolation
+from cmedirl_jax.tabular.discretise import FiniteMDP
+from cmedirl_jax.tabular.optimal_control import value_iteration
+
+POINTS = 61
+"""Points along each observation."""
+ACTIONS = 21
+"""Points along the action, for the value of the optimum."""
+SHOWN = (0, ACTIONS // 2, ACTIONS - 1)
+"""The actions that are shown: the least, the middle one and the largest."""
+
+
+class Learned(NamedTuple):
+    """What a method has learned.
+
+    Attributes:
+        rewards: of its seeds.
+        demonstrated: `[N, 2]`, observations of demonstrations.
+        played: `[M, 2]`, observations of its policies.
+    """
+
+    rewards: Functions
+    demonstrated: np.ndarray
+    played: np.ndarray
+
+
+def fits(env: Any) -> bool:
+    """Whether a task can be drawn: two bounded observations, one action, and known dynamics."""
+    return (
+        isinstance(env, Env)
+        and env.state_at is not None
+        and (env.spec.observation_dim, env.spec.action_dim) == (2, 1)
+        and bool(np.isfinite(env.spec.observation_high).all())
+    )
+
+
+def maps(env: Env, discount: float, learned: Mapping[str, Learned]) -> Figure:
+    """A row for the task's own reward and the optimum's value, and a row for each method.
+
+    Args:
+        env: a task that `fits`.
+        discount: gamma, of V*.
+        learned: by the method's name.
+    """
+    mdp = jax.jit(lambda: discretise.make(env, (POINTS, POINTS), (ACTIONS,)))()
+    best = jax.jit(
+        lambda: (
+            value_iteration(
+                mdp.dynamics, mdp.reward, discount=discount, absorbing=mdp.absorbing
+            ).values
+        )
+    )()
+    rows = 1 + len(learned)
+    figure = Figure(figsize=(11, 2.2 * rows), layout="constrained")
+    panels = figure.subplots(rows, 4, sharex=True, sharey=True, squeeze=False)
+    points = interpolation.points(mdp.actions)[list(SHOWN), 0]
+    reward = np.asarray(mdp.reward)[:-1][:, list(SHOWN)]
+    # The bonus at the end would hide all other differences.
+    _row(figure, panels[0], mdp, np.clip(reward, None, 1.0), "$r_e$, at most 1", points)
+    _map(figure, panels[0][3], mdp, np.asarray(best)[:-1], "$V^*$")
+    for axes, (method, each) in zip(panels[1:], learned.items(), strict=True):
+        mean = np.asarray(_mean(each.rewards, mdp))
+        _row(figure, axes, mdp, mean, f"{curves.label(method)}: mean $r_D$", points)
+        _visits(axes[3], each)
+    figure.supxlabel("first observation", fontsize=10)
+    figure.supylabel("second observation", fontsize=10)
+    return figure
+
+
+def _mean(rewards: Functions, mdp: FiniteMDP) -> jax.Array:
+    """`[S, len(SHOWN)]`, the mean of the seeds' rewards."""
+    states = jnp.asarray(interpolation.points(mdp.states))
+    actions = jnp.asarray(interpolation.points(mdp.actions))[jnp.array(SHOWN)]
+    pairs = jnp.broadcast_to(states[:, None], (len(states), len(SHOWN), 2))
+    done = jnp.broadcast_to(actions[None], (len(states), len(SHOWN), 1))
+    every = jax.jit(lambda each: jax.lax.map(lambda one: rewards.function(one, pairs, done), each))
+    return jnp.mean(every(rewards.params), axis=0)
+
+
+def _row(
+    figure: Figure,
+    axes: Sequence[Axes],
+    mdp: FiniteMDP,
+    values: np.ndarray,
+    name: str,
+    actions: np.ndarray,
+) -> None:
+    """A map for each shown action, with one scale of colours."""
+    low, high = float(values.min()), float(values.max())
+    shown = []
+    for panel, action, column in zip(axes, actions, values.T, strict=False):
+        shown.append(_draw(panel, mdp, column, low, high))
+        panel.set_title(f"{name}, action {action:g}", fontsize=9)
+    figure.colorbar(shown[-1], ax=list(axes[: len(shown)]))
+
+
+def _map(figure: Figure, axes: Axes, mdp: FiniteMDP, values: np.ndarray, name: str) -> None:
+    shown = _draw(axes, mdp, values, float(values.min()), float(values.max()))
+    axes.set_title(name, fontsize=9)
+    figure.colorbar(shown, ax=axes)
+
+
+def _draw(axes: Axes, mdp: FiniteMDP, values: np.ndarray, low: float, high: float) -> Any:
+    first, second = (
+        np.linspace(*ends, POINTS) for ends in zip(mdp.states.low, mdp.states.high, strict=True)
+    )
+    table = values.reshape(POINTS, POINTS).T
+    return axes.pcolormesh(
+        first, second, table, cmap="cividis", vmin=low, vmax=high, rasterized=True
+    )
+
+
+def _visits(axes: Axes, learned: Learned) -> None:
+    for seen, colour, name in (
+        (learned.demonstrated, curves.COLOURS[1], "demonstrations"),
+        (learned.played, curves.COLOURS[0], "policies"),
+    ):
+        axes.plot(*seen.T, ".", color=colour, markersize=1.5, alpha=0.4, label=name)
+    axes.set_title("visited by demonstrations and policies", fontsize=9)
+    axes.legend(loc="lower left", fontsize=7, markerscale=6, frameon=False)
