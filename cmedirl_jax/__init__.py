@@ -29,6 +29,7 @@ The reward
     shaping: how r_D joins the environment's reward (Eq. 10).
     background: the samples that r_D is learned from.
     tabular: maximum-entropy IRL and control with a model (Eqs. 1 and 4-9).
+    assess: is a reward any good: distances between rewards, occupancies, report cards.
 
 Training
     METHODS, Method, Settings: the methods by name, and every choice that they share.
@@ -42,7 +43,7 @@ Types
     EnvSpec, Transition, RewardBatch, Network.
 """
 
-from cmedirl_jax import envs, irl, networks, observation_statistics, tabular, training
+from cmedirl_jax import assess, envs, irl, networks, observation_statistics, tabular, training
 from cmedirl_jax.agents import ddpg, exploration, hot_start
 from cmedirl_jax.data import demonstrations, episodes, replay
 from cmedirl_jax.io import checkpoint
@@ -61,6 +62,7 @@ __all__ = [
     "RewardBatch",
     "Settings",
     "Transition",
+    "assess",
     "background",
     "checkpoint",
     "ddpg",

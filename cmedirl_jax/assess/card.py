@@ -87,12 +87,15 @@ class Occupancies(NamedTuple):
 
 
 def truth(rewards: Rewards, env: Env, coverage: Coverage, discount: Numeric) -> Truth:
-    """Compare rewards with the environment's own on a coverage distribution.
+    """Compare rewards with the environment's own, each on a draw of its own of the coverage.
+
+    The draws differ, so that what differs between rewards of equal quality is also their luck:
+    where r_e is a rare bonus, few steps decide.
 
     Args:
         rewards: of states and actions.
         env: a task that can be set to an observation and draws nothing.
-        coverage: the transitions to compare on.
+        coverage: the transitions to compare each reward on, leaves `[R, ...]`.
         discount: gamma.
 
     Raises:
@@ -105,21 +108,25 @@ def truth(rewards: Rewards, env: Env, coverage: Coverage, discount: Numeric) -> 
         del after
         return paid(observation, action)
 
-    def compared(params: Any) -> Truth:
+    def compared(each: tuple[Any, Coverage]) -> Truth:
+        params, own = each
+
         def learned(observation: jax.Array, action: jax.Array, after: jax.Array) -> jax.Array:
             del after
             return rewards.reward(params, observation, action)
 
-        ours = _forms(learned, follow, coverage, discount)
-        given = learned(*map(jnp.asarray, coverage[:3]))
-        return Truth(
-            distances.pearson(ours[0], forms[0]),
-            distances.pearson(ours[1], forms[1]),
-            _correlation(given, paid(*map(jnp.asarray, coverage[:2]))),
+        epic, dard = (
+            distances.pearson(ours, theirs)
+            for ours, theirs in zip(
+                _forms(learned, follow, own, discount),
+                _forms(true, follow, own, discount),
+                strict=True,
+            )
         )
+        made = tuple(map(jnp.asarray, (own.observation, own.action, own.next_observation)))
+        return Truth(epic, dard, _correlation(learned(*made), true(*made)))
 
-    forms = _forms(true, follow, coverage, discount)
-    return jax.lax.map(compared, rewards.params)
+    return jax.lax.map(compared, (rewards.params, coverage))
 
 
 def _forms(

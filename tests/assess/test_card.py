@@ -37,7 +37,9 @@ REWARDS = Rewards(mixture, WEIGHTS)
 
 
 def test_distances_to_the_true_reward_are_those_of_the_known_relations():
-    made = jax.jit(lambda: coverage_lib.uniform(jax.random.key(0), ENV, 128, 128))()
+    keys = jax.random.split(jax.random.key(0), len(WEIGHTS))
+    draw = jax.vmap(lambda key: coverage_lib.uniform(key, ENV, 256, 64))
+    made = jax.jit(draw)(keys)
     found = jax.jit(lambda: card.truth(REWARDS, ENV, made, DISCOUNT))()
     for distance in (found.epic, found.dard):
         np.testing.assert_allclose(distance[:3], [0.0, 1.0, 0.0], atol=2e-2)

@@ -23,10 +23,11 @@ from cmedirl_jax.runs.report.reward_samples import Context, Sampled
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.tabular import discretise
-from cmedirl_jax.types import Transition
 
-COMPARED = 256
-"""Transitions that rewards are compared on, and draws that their canonical forms average over."""
+COMPARED, DRAWS = 4_096, 64
+"""Transitions that a reward is compared on, and draws that its canonical form averages over."""
+APART = 256
+"""Steps of which the occupancies' distances are taken."""
 SHOWN = 16
 """Steps of each seed that are drawn."""
 GRID = {1: 201, 2: 51}
@@ -77,8 +78,11 @@ def of_run(folder: Path) -> Cards:
         raise UserError(f"{folder}: the run has no demonstrations to assess a reward by")
     try:
         env, learned = envs.find(config["env"]), learned_cells(folder)
+        # Cells of older versions are found out here.
+        for cell in learned:
+            cell.policies()
     except (LookupError, ValueError) as error:
-        raise UserError(" ".join(str(error).split())) from error
+        raise UserError(f"{folder}: {' '.join(str(error).split())}") from error
     rewarded = [cell for cell in learned if (cell.cell.path / "rewards").exists()]
     if not rewarded:
         raise UserError(f"{folder}: none of its methods learns a reward")
@@ -117,7 +121,7 @@ def _of_cell(context: Context, learned: LearnedCell, sampled: Sampled) -> pl.Dat
         columns["loitering"] = columns["largest"] / card.loitering(context.discount, bonus)
     scale = _half_widths(context.env)
     columns |= jax.jit(functools.partial(card.occupancies, context.key, scale))(
-        *(jax.tree.map(lambda leaf: leaf[:, :COMPARED], each) for each in sampled.seen)
+        *(jax.tree.map(lambda leaf: leaf[:, :APART], each) for each in sampled.seen)
     )._asdict()
     # Against the task's own reward.
     if isinstance(context.env, Env) and context.env.state_at is not None:
@@ -152,16 +156,12 @@ def _against_truth(
     context: Context, env: Env, rewards: Rewards, sampled: Sampled
 ) -> dict[str, Any]:
     columns: dict[str, Any] = {}
-    visited = jax.tree.map(
-        lambda *leaves: np.concatenate([leaf.reshape(-1, *leaf.shape[2:]) for leaf in leaves]),
-        *sampled.seen,
-    )
-    for name, made in _coverages(context, env, visited):
+    for name, made in _coverages(context, env, sampled):
         found = jax.jit(
-            lambda params, made=made: card.truth(
+            lambda params, made: card.truth(
                 Rewards(rewards.reward, params), env, made, context.discount
             )
-        )(rewards.params)
+        )(rewards.params, made)
         columns |= {f"epic_{name}": found.epic, f"dard_{name}": found.dard}
         columns["correlation"] = found.correlation
     points = GRID.get(env.spec.observation_dim)
@@ -179,15 +179,16 @@ def _against_truth(
 
 
 def _coverages(
-    context: Context, env: Env, visited: Transition
+    context: Context, env: Env, sampled: Sampled
 ) -> Iterator[tuple[str, coverage.Coverage]]:
-    """The coverage distributions by name; the visited one comes last."""
+    """The coverage distributions by name, a draw for each seed; the visited one comes last."""
+    visited = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *sampled.seen)
+    keys = jax.random.split(context.key, len(visited.reward))
     if np.isfinite(env.spec.observation_high).all():
-        yield (
-            "uniform",
-            jax.jit(lambda key: coverage.uniform(key, env, COMPARED, COMPARED))(context.key),
-        )
-    yield "visited", coverage.visited(context.key, visited, COMPARED, COMPARED)
+        draw = functools.partial(coverage.uniform, env=env, count=COMPARED, draws=DRAWS)
+        yield "uniform", jax.jit(jax.vmap(draw))(keys)
+    draw = functools.partial(coverage.visited, count=COMPARED, draws=DRAWS)
+    yield "visited", jax.jit(jax.vmap(draw))(keys, visited)
 
 
 def summarise(rows: pl.DataFrame, seeds: pl.DataFrame) -> pl.DataFrame:

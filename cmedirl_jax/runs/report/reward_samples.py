@@ -1,19 +1,19 @@
 """Steps of demonstrations and policies by which rewards are judged."""
 
-import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.runs.cells import pools, recording
 from cmedirl_jax.runs.load import LearnedCell
 from cmedirl_jax.types import DemonstrationSubset, Transition
 
-SAMPLED = 512
+SAMPLED = 2_048
 """Steps of demonstrations, and of each policy."""
 EPISODES = 4
 """Episodes of each policy, from random starts."""
@@ -43,26 +43,32 @@ class Sampled(NamedTuple):
 
 def of_cell(context: Context, learned: LearnedCell) -> Sampled:
     """Steps of the demonstrations and the policies of a cell."""
-    key = learned.cell.key
-    played = _played(context, learned)
-    rng = np.random.default_rng(0)
-    episodes = pools.of_learners(context.pool, context.seeds).data.episodes
-    mine = [_rows(episodes, seed) for seed in key.seed_range]
-    every = np.arange(len(context.pool.episode))
-    others = [np.setdiff1d(every, rows) for rows in mine]
+    rng, pool = np.random.default_rng(0), context.pool
+    every = demonstrations.episodes(pool)
+    learners = pools.of_learners(pool, context.seeds).data.episodes
+    mine, others = [], []
+    for seed in learned.cell.key.seed_range:
+        own = DemonstrationSubset(*(np.asarray(leaf)[seed] for leaf in learners))
+        unseen = ~np.isin(every.start, own.start)
+        mine.append((pool, own))
+        others.append((pool, DemonstrationSubset(*(leaf[unseen] for leaf in every))))
+    played = [(each, demonstrations.episodes(each)) for each in _played(context, learned)]
+    held_out = _drawn(rng, others) if all(subset.start.size for _, subset in others) else None
+    return Sampled((_drawn(rng, mine), _drawn(rng, played)), held_out)
 
-    def drawn(of_seeds: Sequence[tuple[Demonstrations, np.ndarray]]) -> Transition:
-        parts = []
-        for pool, rows in of_seeds:
-            chosen = rng.choice(rows, SAMPLED)
-            parts.append([np.asarray(leaf)[chosen] for leaf in pool.transition])
-        return Transition(*(np.stack(leaves) for leaves in zip(*parts, strict=True)))
 
-    seen = drawn([(context.pool, rows) for rows in mine])
-    policies = drawn([(pool, np.arange(len(pool.episode))) for pool in played])
-    unseen = all(len(rows) for rows in others)
-    held_out = drawn([(context.pool, rows) for rows in others]) if unseen else None
-    return Sampled((seen, policies), held_out)
+def _drawn(
+    rng: np.random.Generator, of_seeds: Sequence[tuple[Demonstrations, DemonstrationSubset]]
+) -> Transition:
+    """Steps of each seed's episodes, each step alike, leaves `[seeds, SAMPLED, ...]`."""
+    parts = []
+    for pool, (start, length) in of_seeds:
+        ends = np.cumsum(length)
+        index = rng.integers(ends[-1], size=SAMPLED)
+        episode = np.searchsorted(ends, index, side="right")
+        rows = start[episode] + index - (ends - length)[episode]
+        parts.append([np.asarray(leaf)[rows] for leaf in pool.transition])
+    return Transition(*(np.stack(leaves) for leaves in zip(*parts, strict=True)))
 
 
 def _played(context: Context, learned: LearnedCell) -> list[Demonstrations]:
@@ -71,8 +77,14 @@ def _played(context: Context, learned: LearnedCell) -> list[Demonstrations]:
     keys = jax.random.split(context.key, learned.cell.key.seeds)
     if isinstance(env, HostEnv):
         return recording.record_on_host(act, env, actors, list(keys), EPISODES)
-    one = functools.partial(recording.record, act, env, episodes=EPISODES)
-    transition, running, truncated = jax.device_get(jax.jit(jax.vmap(one))(actors, keys))
+
+    @jax.jit
+    def one(actor: Any, key: jax.Array) -> tuple[Transition, jax.Array, jax.Array]:
+        return recording.record(act, env, actor, key, EPISODES)
+
+    # One after the other: side by side, each step would copy what all steps before wrote.
+    played = jax.device_get(jax.lax.map(lambda each: one(*each), (actors, keys)))
+    transition, running, truncated = played
     return [
         recording.flatten(
             jax.tree.map(lambda leaf, seed=seed: leaf[seed], transition),
@@ -81,9 +93,3 @@ def _played(context: Context, learned: LearnedCell) -> list[Demonstrations]:
         )
         for seed in range(len(keys))
     ]
-
-
-def _rows(episodes: DemonstrationSubset, learner: int) -> np.ndarray:
-    """The steps of the episodes that a learner draws from."""
-    start, length = (np.asarray(leaf)[learner] for leaf in episodes)
-    return np.concatenate([np.arange(s, s + n) for s, n in zip(start, length, strict=True)])
