@@ -73,7 +73,7 @@ def maps(env: Env, discount: float, learned: Mapping[str, Learned]) -> Figure:
     _map(figure, panels[0][3], mdp, np.asarray(best)[:-1], "$V^*$")
     for axes, (method, each) in zip(panels[1:], learned.items(), strict=True):
         mean = np.asarray(_mean(each.rewards, mdp))
-        _row(figure, axes, mdp, mean, f"{curves.label(method)}: mean $r_D$", points)
+        _row(figure, axes, mdp, mean, f"{curves.label(method)}, mean $r_D$", points)
         _visits(axes[3], each)
     figure.supxlabel("first observation", fontsize=10)
     figure.supylabel("second observation", fontsize=10)
@@ -100,10 +100,13 @@ def _row(
 ) -> None:
     """A map for each shown action, with one scale of colours."""
     low, high = float(values.min()), float(values.max())
+    if low == high:
+        low, high = low - 1.0, high + 1.0
     shown = []
     for panel, action, column in zip(axes, actions, values.T, strict=False):
         shown.append(_draw(panel, mdp, column, low, high))
-        panel.set_title(f"{name}, action {action:g}", fontsize=9)
+        panel.set_title(f"action {action:g}", fontsize=9)
+    axes[0].set_ylabel(name, fontsize=9)
     figure.colorbar(shown[-1], ax=list(axes[: len(shown)]))
 
 
@@ -129,5 +132,5 @@ def _visits(axes: Axes, learned: Learned) -> None:
         (learned.played, curves.COLOURS[0], "policies"),
     ):
         axes.plot(*seen.T, ".", color=colour, markersize=1.5, alpha=0.4, label=name)
-    axes.set_title("visited by demonstrations and policies", fontsize=9)
+    axes.set_title("visited", fontsize=9)
     axes.legend(loc="lower left", fontsize=7, markerscale=6, frameon=False)
