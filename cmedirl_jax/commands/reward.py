@@ -45,9 +45,9 @@ def run(options: Options) -> int:
     with run_folder.held(folder):
         cards = reward_cards.of_run(folder)
         summary = reward_cards.summarise(cards.rows, tables.read(folder, config)["seeds"])
-        content, to = io.BytesIO(), folder / run_folder.REWARD
-        cards.rows.write_parquet(content)
-        outputs.write(to / "seeds.parquet", content.getvalue())
+        buffer, to = io.BytesIO(), folder / run_folder.REWARD
+        cards.rows.write_parquet(buffer)
+        outputs.write(to / "seeds.parquet", buffer.getvalue())
         outputs.write(to / "summary.csv", summary.write_csv().encode())
         if cards.maps is not None:
             drawing.save(cards.maps, [to / "maps.png", to / "maps.svg"], streams.complain)
