@@ -17,7 +17,7 @@ from tests.support import compiling, runs
 # The first example of a test compiles, so deadlines would only measure the compiler.
 # The examples are the same in every run: more of them would only be slower.
 hypothesis.settings.register_profile(
-    "reproducible", deadline=None, derandomize=True, max_examples=50
+    "reproducible", deadline=None, derandomize=True, max_examples=30
 )
 hypothesis.settings.load_profile("reproducible")
 

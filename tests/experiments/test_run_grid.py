@@ -587,14 +587,6 @@ def test_more_methods_numbers_and_seeds_train_what_is_missing(smoke, unoptimised
         assert_frame_equal(found, pl.read_parquet(alone / name), rel_tol=1e-2, abs_tol=1e-2)
 
 
-def test_figures_that_are_gone_are_drawn_again(smoke, main, tmp_path):
-    folder = shutil.copytree(smoke[0], tmp_path / "run")
-    shutil.rmtree(folder / "figures")
-    assert main(*SMOKE, "--out", folder) == 0
-    assert (folder / "figures" / "figure3.png").exists()
-    assert (folder / "summary.csv").read_bytes() == (smoke[0] / "summary.csv").read_bytes()
-
-
 def test_figures_that_cannot_be_drawn_are_lines_and_the_results_stand(
     smoke, main, monkeypatch, tmp_path, capsys
 ):
