@@ -310,6 +310,7 @@ def can_mount():
 needs_mount = pytest.mark.skipif(not can_mount(), reason="this user may not mount a file system")
 
 
+@pytest.mark.slow
 @needs_mount
 def test_a_full_disk_ends_a_run_that_goes_on_once_there_is_room(runs, whole, tmp_path):
     """It fills up in the second cell: checkpoints fail, then the results do."""

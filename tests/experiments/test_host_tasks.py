@@ -94,6 +94,7 @@ def test_a_run_that_was_cut_off_goes_on_at_the_start_of_an_episode(tmp_path, mon
     assert evaluations["env_step"].max() == 240
 
 
+@pytest.mark.slow
 def test_experts_that_all_share_are_more_than_the_learners(tmp_path):
     """On two devices, of which one has an idle slot."""
     small = [*SMALL[:-2], "--devices", "2", "--expert", "best", "--experts.seeds", "4"]
@@ -104,6 +105,7 @@ def test_experts_that_all_share_are_more_than_the_learners(tmp_path):
     assert seeds["expert_id"].n_unique() == 1
 
 
+@pytest.mark.slow
 def test_processes_of_their_own_change_no_number(run, tmp_path):
     folder = tmp_path / "run"
     command = [*SMALL, "--methods", "ddpg", "--out", str(folder), "--asynchronous"]

@@ -111,7 +111,7 @@ def test_every_reward_is_fitted_and_vmaps(data, mdp, kind, reward):
 
 
 @pytest.mark.optimised
-@pytest.mark.parametrize("kind", ["linear", "deep"])
+@pytest.mark.parametrize("kind", ["linear", pytest.param("deep", marks=pytest.mark.slow)])
 def test_the_reward_of_twelve_demonstrations_solves_the_task(kind):
     """The greedy policy and the soft one, from each of 20 start states."""
     settings = TabularSettings()
