@@ -411,6 +411,7 @@ pathlib.Path(sys.argv[1]).write_text(json.dumps(spent))
 """
 
 
+@pytest.mark.slow
 def test_the_main_job_runs_cold_and_warm(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(main_job, "_CHILD", CHILD)
     yardstick = f"{sys.executable} -c \"print('1000 steps/s')\""

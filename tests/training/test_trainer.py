@@ -185,9 +185,9 @@ def test_r_star_is_stored_as_the_shaping_says(shaping, inputs):
 @pytest.mark.parametrize(
     ("objective", "weights"),
     [
-        ("transition", "recorded"),
+        pytest.param("transition", "recorded", marks=pytest.mark.slow),
         ("transition", "fusion"),
-        ("trajectory", "uniform"),
+        pytest.param("trajectory", "uniform", marks=pytest.mark.slow),
         ("trajectory", "fusion"),
     ],
 )

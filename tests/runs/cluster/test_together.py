@@ -202,6 +202,7 @@ def assert_same_tables(folder, expected):
         assert_frame_equal(found, wanted, rel_tol=1e-3, abs_tol=1e-3)
 
 
+@pytest.mark.slow
 def test_stopped_together_or_bereaved_they_go_on_to_what_one_process_gives(
     together, alone, tmp_path
 ):
