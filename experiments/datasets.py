@@ -82,7 +82,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         reference: list[str] = []
         for quality in get_args(Quality):
             name = f"{task.name}/{quality}-v0"
-            for command in _commands(task, name, quality, options, reference) if _new(name) else ():
+            new = name not in minari.list_local_datasets()
+            for command in _commands(task, name, quality, options, reference) if new else ():
                 if code := cmedirl.main(command):
                     return code
             dataset = minari.load_dataset(name, download=False)
@@ -94,12 +95,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     outputs.write(options.out / "datasets.csv", table.write_csv(float_precision=2).encode())
     screen.show(screen.console(), shown(table))
     return 0
-
-
-def _new(name: str) -> bool:
-    import minari  # type: ignore[import-not-found]
-
-    return name not in minari.list_local_datasets()
 
 
 def _commands(

@@ -2,8 +2,8 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
+from cmedirl_jax import normalisation
 from cmedirl_jax.assess.distances import Coverage, Successor
 from cmedirl_jax.envs import Env
 from cmedirl_jax.types import Transition
@@ -44,8 +44,7 @@ def uniform(key: jax.Array, env: Env, count: int, draws: int) -> Coverage:
         ValueError: as `successor`, or for a bound that is infinite.
     """
     spec, follow = env.spec, successor(env)
-    bounds = (spec.observation_low, spec.observation_high)
-    if not all(np.isfinite(bound).all() for bound in bounds):
+    if not normalisation.sensible(spec).all():
         raise ValueError(f"{spec.id}: its observations have no finite bounds to draw within")
     keys = jax.random.split(key, 5)
     observation, action = _live(keys[0], env, count), _actions(keys[1], env, count)

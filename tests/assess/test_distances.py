@@ -177,6 +177,11 @@ def test_uniform_coverage_lies_within_the_bounds_and_follows_the_task():
     np.testing.assert_array_equal(
         jax.vmap(step)(made.observation, made.action), made.next_observation
     )
+    # Bounds as large as floats are say nothing, although they are finite.
+    largest = np.full(2, np.finfo(np.float32).max)
+    boundless = spec._replace(observation_low=-largest, observation_high=largest)
+    with pytest.raises(ValueError, match="no finite bounds"):
+        coverage_lib.uniform(jax.random.key(0), env._replace(spec=boundless), 5, 2)
     with pytest.raises(ValueError, match="does not say which state"):
         coverage_lib.successor(env._replace(state_at=None))
 

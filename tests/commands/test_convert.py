@@ -6,16 +6,9 @@ import pytest
 
 from cmedirl_jax.commands.cmedirl import main
 from cmedirl_jax.data import demonstrations
-from cmedirl_jax.data.formats import tables
 from tests.support import pools
 
 CAR = ["--env", pools.ENV.spec.id]
-
-
-@pytest.fixture
-def table(tmp_path):
-    tables.write_table(tmp_path / "pool.csv", pools.scripted(3))
-    return tmp_path / "pool.csv"
 
 
 def test_convert_keeps_every_step_and_computes_what_is_missing(table, tmp_path, capsys):

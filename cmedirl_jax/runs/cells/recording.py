@@ -23,24 +23,35 @@ def record_all(
     episodes: int,
     metadata: dict[str, Any],
 ) -> Demonstrations:
-    """Record `episodes` episodes of each of the `actors` `[P, ...]`, one actor after the other.
+    """Record episodes of actors, one actor after the other; see `record_each`.
 
     Args:
         act: `(actor, observation [..., O]) -> action [..., A]`.
         env: the task.
-        actors: the policies' parameters.
+        actors: the policies' parameters `[P, ...]`.
         keys: of each policy's starts.
         episodes: of each policy.
         metadata: of the pool, which gets the episodes' mean return and its deviation too.
     """
+    return joined(record_each(act, env, actors, keys, episodes), metadata)
+
+
+def record_each(
+    act: Callable[[Any, jax.Array], jax.Array],
+    env: Env | HostEnv,
+    actors: Any,
+    keys: Sequence[jax.Array],
+    episodes: int,
+) -> list[Demonstrations]:
+    """The pool of each actor, without metadata; `record_all` describes the arguments."""
     if isinstance(env, HostEnv):
-        return joined(record_on_host(act, env, actors, keys, episodes), metadata)
+        return record_on_host(act, env, actors, keys, episodes)
     record_one = jax.jit(lambda actor, key: record(act, env, actor, key, episodes))
     parts = []
     for index, key in enumerate(keys):
         actor = jax.tree.map(lambda leaf, index=index: leaf[index], actors)
         parts.append(flatten(*jax.tree.map(np.asarray, record_one(actor, key))))
-    return joined(parts, metadata)
+    return parts
 
 
 def record(
@@ -104,7 +115,7 @@ def record_on_host(
     keys: Sequence[jax.Array],
     episodes: int,
 ) -> list[Demonstrations]:
-    """The pool of each actor, without metadata; `record_all` describes the arguments."""
+    """As `record_each`, for a task on the host."""
     act_all = jax.jit(jax.vmap(act))
     seeds = np.stack([jax.random.bits(key, (episodes,), jnp.uint32) for key in keys])
     with contextlib.closing(env.vector(len(keys))) as vector:

@@ -144,12 +144,9 @@ def _bonus(pool: Demonstrations) -> float | None:
 
 
 def _half_widths(env: Env | HostEnv) -> np.ndarray:
-    """`[O + A]`; 1 where a bound is infinite."""
-    spec = env.spec
-    low = np.concatenate([spec.observation_low, spec.action_low])
-    high = np.concatenate([spec.observation_high, spec.action_high])
-    half = (high.astype(np.float64) - low) / 2.0
-    return np.where(np.isfinite(half) & (half < normalisation.SENSIBLE), half, 1.0)
+    """`[O + A]`; 1 where a bound says nothing."""
+    of_actions = (env.spec.action_high - env.spec.action_low) / 2
+    return np.concatenate([normalisation.make(env.spec, "bounds").half_width, of_actions])
 
 
 def _against_truth(
@@ -165,7 +162,7 @@ def _against_truth(
         columns |= {f"epic_{name}": found.epic, f"dard_{name}": found.dard}
         columns["correlation"] = found.correlation
     points = GRID.get(env.spec.observation_dim)
-    if points is not None and np.isfinite(env.spec.observation_high).all():
+    if points is not None and normalisation.sensible(env.spec).all():
         mdp = jax.jit(
             lambda: discretise.make(
                 env, (points,) * env.spec.observation_dim, (ACTIONS,) * env.spec.action_dim
@@ -184,7 +181,7 @@ def _coverages(
     """The coverage distributions by name, a draw for each seed; the visited one comes last."""
     visited = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *sampled.seen)
     keys = jax.random.split(context.key, len(visited.reward))
-    if np.isfinite(env.spec.observation_high).all():
+    if normalisation.sensible(env.spec).all():
         draw = functools.partial(coverage.uniform, env=env, count=COMPARED, draws=DRAWS)
         yield "uniform", jax.jit(jax.vmap(draw))(keys)
     draw = functools.partial(coverage.visited, count=COMPARED, draws=DRAWS)

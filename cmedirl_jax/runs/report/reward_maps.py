@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cmedirl_jax import normalisation
 from cmedirl_jax.envs import Env
 from cmedirl_jax.runs.drawing import Axes, Figure
 from cmedirl_jax.runs.load import Functions
@@ -43,7 +44,7 @@ def fits(env: Any) -> bool:
         isinstance(env, Env)
         and env.state_at is not None
         and (env.spec.observation_dim, env.spec.action_dim) == (2, 1)
-        and bool(np.isfinite(env.spec.observation_high).all())
+        and bool(normalisation.sensible(env.spec).all())
     )
 
 

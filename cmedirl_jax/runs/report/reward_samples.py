@@ -1,7 +1,7 @@
 """Steps of demonstrations and policies by which rewards are judged."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -73,23 +73,6 @@ def _drawn(
 
 def _played(context: Context, learned: LearnedCell) -> list[Demonstrations]:
     """Noise-free episodes of each seed's best policy."""
-    env, (act, actors) = context.env, learned.policies()
+    act, actors = learned.policies()
     keys = jax.random.split(context.key, learned.cell.key.seeds)
-    if isinstance(env, HostEnv):
-        return recording.record_on_host(act, env, actors, list(keys), EPISODES)
-
-    @jax.jit
-    def one(actor: Any, key: jax.Array) -> tuple[Transition, jax.Array, jax.Array]:
-        return recording.record(act, env, actor, key, EPISODES)
-
-    # One after the other: side by side, each step would copy what all steps before wrote.
-    played = jax.device_get(jax.lax.map(lambda each: one(*each), (actors, keys)))
-    transition, running, truncated = played
-    return [
-        recording.flatten(
-            jax.tree.map(lambda leaf, seed=seed: leaf[seed], transition),
-            running[seed],
-            truncated[seed],
-        )
-        for seed in range(len(keys))
-    ]
+    return recording.record_each(act, context.env, actors, list(keys), EPISODES)
