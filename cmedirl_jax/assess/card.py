@@ -14,6 +14,7 @@ from cmedirl_jax.assess import coverage as coverage_lib
 from cmedirl_jax.assess import distances, occupancy
 from cmedirl_jax.assess.distances import Coverage
 from cmedirl_jax.envs import Env
+from cmedirl_jax.envs.base import step_from
 from cmedirl_jax.tabular import interpolation
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.tabular.optimal_control import value_iteration
@@ -140,12 +141,9 @@ def _forms(
 
 def _true_reward(env: Env) -> Callable[[jax.Array, jax.Array], jax.Array]:
     """r_e of observations `[..., O]` and actions `[..., A]`."""
-    assert env.state_at is not None
-    state_at, params = env.state_at, env.default_params
 
     def paid(observation: jax.Array, action: jax.Array) -> jax.Array:
-        state = state_at(observation, params)
-        return env.step(jax.random.key(0), state, action, params)[1].reward
+        return step_from(env, env.default_params, observation, action).reward
 
     return jnp.vectorize(paid, signature="(o),(a)->()")
 

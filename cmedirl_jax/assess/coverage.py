@@ -1,11 +1,14 @@
 """Coverage distributions: the transitions on which rewards are compared."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
 from cmedirl_jax import normalisation
 from cmedirl_jax.assess.distances import Coverage, Successor
 from cmedirl_jax.envs import Env
+from cmedirl_jax.envs.base import step_from
 from cmedirl_jax.types import Transition
 
 OVERSAMPLING = 4
@@ -20,13 +23,8 @@ def successor(env: Env) -> Successor:
     """
     if env.state_at is None:
         raise ValueError(f"{env.spec.id} does not say which state an observation is of")
-    state_at, params = env.state_at, env.default_params
-
-    def follow(observation: jax.Array, action: jax.Array) -> jax.Array:
-        state = state_at(observation, params)
-        return env.step(jax.random.key(0), state, action, params)[1].observation
-
-    return follow
+    step = functools.partial(step_from, env, env.default_params)
+    return lambda observation, action: step(observation, action).observation
 
 
 def uniform(key: jax.Array, env: Env, count: int, draws: int) -> Coverage:
@@ -68,22 +66,17 @@ def _live(key: jax.Array, env: Env, count: int) -> jax.Array:
 
     A step also makes observations of a state that draws are not, such as a cosine and a sine.
     """
-    assert env.state_at is not None
-    state_at, params, spec = env.state_at, env.default_params, env.spec
-    keys = jax.random.split(key)
+    spec, keys = env.spec, jax.random.split(key)
     shape = (OVERSAMPLING * count, spec.observation_dim)
     bounds = spec.observation_low, spec.observation_high
     drawn = jax.random.uniform(keys[0], shape, jnp.float32, *bounds)
 
-    def step(observation: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-        state = state_at(observation, params)
-        answer = env.step(jax.random.key(0), state, action, params)[1]
-        return answer.observation, answer.terminated
-
-    after, ended = jax.vmap(step)(drawn, _actions(keys[1], env, len(drawn)))
+    step = jax.vmap(functools.partial(step_from, env, env.default_params))
+    answer = step(drawn, _actions(keys[1], env, len(drawn)))
     # Those that go on come first; were they fewer than asked for, they would be taken again.
-    going_on = jnp.maximum(jnp.sum(~ended), 1)
-    return after[jnp.argsort(ended, stable=True)[jnp.arange(count) % going_on]]
+    going_on = jnp.maximum(jnp.sum(~answer.terminated), 1)
+    order = jnp.argsort(answer.terminated, stable=True)
+    return answer.observation[order[jnp.arange(count) % going_on]]
 
 
 def visited(key: jax.Array, transition: Transition, count: int, draws: int) -> Coverage:

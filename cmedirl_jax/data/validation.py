@@ -8,6 +8,7 @@ import numpy as np
 
 from cmedirl_jax import checks
 from cmedirl_jax.envs import Env, HostEnv, split_id
+from cmedirl_jax.envs.base import step_from
 from cmedirl_jax.types import Demonstrations, EnvSpec, Transition
 
 ABSENT = ("action", "reward")
@@ -186,14 +187,11 @@ def steps(env: Env, params: Any, made: Transition) -> np.ndarray:
 
     Next observation, reward and terminated side by side, `[3, N, O + 2]`.
     """
-    assert env.state_at is not None
-    state_at = env.state_at
     observation, action = (x.astype(np.float32) for x in (made.observation, made.action))
     nudge = (4.0 / checks.ROUNDINGS * checks.tolerance(observation)).astype(np.float32)
 
     def step(observation: jax.Array, action: jax.Array) -> jax.Array:
-        state = state_at(observation, params)
-        answer = env.step(jax.random.key(0), state, action, params)[1]
+        answer = step_from(env, params, observation, action)
         return jnp.concatenate([answer.observation, jnp.stack([answer.reward, answer.terminated])])
 
     def nudged(sign: jax.Array) -> jax.Array:

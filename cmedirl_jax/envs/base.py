@@ -118,3 +118,16 @@ class Env(NamedTuple):
     starts: Callable[[int, Any], tuple[Any, jax.Array]]
     state_at: Callable[[jax.Array, Any], Any] | None = None
     gymnasium_state: Callable[[Any], np.ndarray] | None = None
+
+
+def step_from(env: Env, params: Any, observation: jax.Array, action: jax.Array) -> Step:
+    """What a task that draws nothing answers to an action `[A]` at an observation `[O]`.
+
+    Args:
+        env: whose `state_at` is given.
+        params: its parameters.
+        observation: which determines the state.
+        action: the action.
+    """
+    assert env.state_at is not None
+    return env.step(jax.random.key(0), env.state_at(observation, params), action, params)[1]

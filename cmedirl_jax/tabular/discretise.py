@@ -21,6 +21,7 @@ import numpy as np
 from cmedirl_jax import checks, normalisation
 from cmedirl_jax import grids as grids_lib
 from cmedirl_jax.envs import Env, Step
+from cmedirl_jax.envs.base import step_from
 from cmedirl_jax.tabular import interpolation
 from cmedirl_jax.tabular.dynamics import SparseDynamics
 from cmedirl_jax.tabular.interpolation import Grid
@@ -127,9 +128,8 @@ def _successors(
 
 
 def _step_from(env: Env, params: Any, observation: jax.Array, action: jax.Array) -> Step:
-    assert env.state_at is not None
     inside = jnp.clip(observation, env.spec.observation_low, env.spec.observation_high)
-    return env.step(jax.random.key(0), env.state_at(inside, params), action, params)[1]
+    return step_from(env, params, inside, action)
 
 
 def _append_row(leaf: jax.Array, value: float) -> jax.Array:
