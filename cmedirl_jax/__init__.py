@@ -38,6 +38,7 @@ Training
     seeds: many seeds in one program, on several devices.
     evaluation: noise-free returns.
     checkpoint: pytrees on disk.
+    export: functions as files that other programs read without this library.
 
 Types
     EnvSpec, Transition, RewardBatch, Network.
@@ -46,7 +47,7 @@ Types
 from cmedirl_jax import assess, envs, irl, networks, observation_statistics, tabular, training
 from cmedirl_jax.agents import ddpg, exploration, hot_start
 from cmedirl_jax.data import demonstrations, episodes, replay
-from cmedirl_jax.io import checkpoint
+from cmedirl_jax.io import checkpoint, export
 from cmedirl_jax.irl import reward_batches as background
 from cmedirl_jax.irl import rewards, shaping
 from cmedirl_jax.training import evaluation, schedules, seeds
@@ -71,6 +72,7 @@ __all__ = [
     "episodes",
     "evaluation",
     "exploration",
+    "export",
     "hot_start",
     "irl",
     "networks",

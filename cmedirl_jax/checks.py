@@ -12,6 +12,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 
 from cmedirl_jax import ranges
 from cmedirl_jax.ranges import Range
@@ -170,14 +171,14 @@ def array_size(name: str, shape: Sequence[int], remedy: str) -> None:
 
     Args:
         name: of the array, for the message.
-        shape: its shape, before it is made.
+        shape: its shape, before it is made; sizes that `jax.export` leaves open do not count.
         remedy: which option to change.
 
     Raises:
         ValueError: with its size and the remedy.
     """
     # Exact, and printable where it is beyond a float.
-    size = Decimal(math.prod(map(int, shape)))
+    size = Decimal(math.prod(int(size) for size in shape if not export.is_symbolic_dim(size)))
     if size > LARGEST_ARRAY:
         raise ValueError(
             f"{name} would be {size:.3g} numbers ({size / 2**28:.3g} GiB in float32), "

@@ -1,5 +1,5 @@
-"""Is a learned reward any good: distances between rewards, and occupancies."""
+"""Is a learned reward any good: distances, occupancies, what it reads, agents on it alone."""
 
-from cmedirl_jax.assess import card, coverage, distances, occupancy
+from cmedirl_jax.assess import card, coverage, distances, importance, occupancy, retraining
 
-__all__ = ["card", "coverage", "distances", "occupancy"]
+__all__ = ["card", "coverage", "distances", "importance", "occupancy", "retraining"]

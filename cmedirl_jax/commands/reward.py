@@ -1,74 +1,137 @@
-"""Say whether the rewards that a run has learned are worth keeping: a report card per method.
+"""Say whether the rewards that a run has learned are worth keeping, and carry one away.
 
 Example: cmedirl reward results/tuned
+With fresh agents on each reward: --retrain 12000 --physics power=0.0012 gravity=0.003
+One learner's reward and policy as files: --export r_d --method hs-me-ddpg --seed 3
 
 Distances and correlations need the task's own reward, in JAX; the rest is of demonstrations and
-policies alone. The card is written to RUN/reward/ too, with a row for each learner.
+policies alone. RUN/reward/ gets report.html, tables with a row for each learner, and pictures.
 """
 
 import dataclasses
-import io
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import polars as pl
-import tyro
 from rich import box
+from rich.console import Console
 from rich.table import Table
 
-from cmedirl_jax.runs import start
-from cmedirl_jax.runs.console import compile_cache, screen, streams
+from cmedirl_jax.commands import sources
+from cmedirl_jax.ranges import Size
+from cmedirl_jax.runs import carry, start
+from cmedirl_jax.runs.cluster.base import ClusterOptions
+from cmedirl_jax.runs.console import compile_cache, screen
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.report.base import Run
 from cmedirl_jax.runs.storage import folder as run_folder
-from cmedirl_jax.runs.storage import outputs, tables
+from cmedirl_jax.runs.storage import tables
+
+if TYPE_CHECKING:
+    from cmedirl_jax.runs.report.reward_report import Judgement
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
-    """Which run.
+class Options(sources.PolicyOptions):
+    """Which run; of its learners, the one whose reward is carried away.
 
     Attributes:
-        folder: A run's folder. Cells that are not finished are left out.
+        retrain: Environment steps of fresh agents that learn from each reward alone, frozen.
+        physics: Other parameters of the task to retrain under too, as power=0.0012 or
+            start_low=-0.9,start_high=-0.7.
+        export: A new folder for the learner's reward and policy, as files that other programs read.
+        licence: Of the exported reward, for its card.
     """
 
-    folder: Annotated[Path, tyro.conf.Positional]
+    retrain: Size | None = None
+    physics: tuple[str, ...] = ()
+    export: Path | None = None
+    licence: str = "none given"
 
 
 def run(options: Options) -> int:
     """Run the command; returns its exit code."""
     folder, config = options.folder, run_folder.read(options.folder)["config"]
+    if options.physics and options.retrain is None:
+        raise UserError("--physics: says under what to retrain; give --retrain too")
+    chosen = None
+    if options.export is not None:
+        chosen = sources.learned(folder, options.method, options.seed, options.n_demos)
+        carry.check(options.export, chosen)
     compile_cache.use_cache()
-    start.devices()
+    devices = start.devices()
+    if options.retrain is not None:
+        devices = start.start(ClusterOptions(), None, config["seeds"], {})[1]
     # scipy takes a second to import: a refusal does not wait for it.
-    from cmedirl_jax.runs import drawing
-    from cmedirl_jax.runs.report import reward_cards
+    from cmedirl_jax.runs.report import retrained, reward_report, reward_samples
 
-    with run_folder.held(folder):
-        cards = reward_cards.of_run(folder)
-        summary = reward_cards.summarise(cards.rows, tables.read(folder, config)["seeds"])
-        buffer, to = io.BytesIO(), folder / run_folder.REWARD
-        cards.rows.write_parquet(buffer)
-        outputs.write(to / "seeds.parquet", buffer.getvalue())
-        outputs.write(to / "summary.csv", summary.write_csv().encode())
-        if cards.maps is not None:
-            drawing.save(cards.maps, [to / "maps.png", to / "maps.svg"], streams.complain)
     console = screen.console()
-    screen.show(console, _table(summary))
-    for measure in summary["measure"].unique(maintain_order=True):
-        screen.say(console, f"{measure}: {reward_cards.MEASURES[measure]}")
-    screen.say(console, f"Report card: {to}")
+    with run_folder.held(folder):
+        written = run_folder.read(folder)
+        run = Run(folder, config, run_folder.solved(folder, written), tables.read(folder, config))
+        judged, plan = reward_samples.read(folder), None
+        if options.retrain is not None:
+            plan = retrained.plan(
+                judged.context,
+                options.retrain,
+                options.physics,
+                judged.cells[0][0].settings,
+                devices,
+            )
+        found = reward_report.write(run, judged, plan, lambda line: screen.say(console, line))
+    _show(console, found)
+    screen.say(console, f"Report: {folder / run_folder.REWARD / 'report.html'}")
+    if options.export is not None and chosen is not None:
+        carry.save(
+            options.export,
+            folder,
+            chosen,
+            options.seed,
+            licence=options.licence,
+            card=found.rows,
+            summary=found.summary,
+        )
+        screen.say(console, f"Reward and policy: {options.export}")
     return 0
 
 
-def _table(summary: pl.DataFrame) -> Table:
-    """A row for each cell, a column for each measure."""
-    seeds = summary["seeds"].max()
-    printed = Table(title=f"{seeds} seeds per row; 95% intervals", box=box.SIMPLE)
-    measures = summary["measure"].unique(maintain_order=True).to_list()
-    for name in ("method", "N_T", *(measure.replace("_", "\n") for measure in measures)):
+def _show(console: Console, found: "Judgement") -> None:
+    """Print what was found: tables, and what their columns are."""
+    from cmedirl_jax.runs.report import retrained, reward_cards, reward_diagnostics
+
+    title = f"{found.summary['seeds'].max()} seeds per row; 95% intervals"
+    _explained(console, _table(found.summary, "measure", title), reward_cards.MEASURES)
+    # Of fewer than four learners there is no correlation.
+    if not found.trusted.is_empty():
+        title = "rank correlation with the learners' return at the end; 95% intervals"
+        trusted = found.trusted.rename({"rank_correlation": "mean"})
+        _explained(console, _table(trusted, "diagnostic", title), reward_diagnostics.DIAGNOSTICS)
+    if found.retraining is None:
+        return
+    for (physics,), rows in found.retraining.group_by("physics", maintain_order=True):
+        screen.show(
+            console, _table(rows, "measure", f"fresh agents on each reward, {physics} physics")
+        )
+    for name, said in retrained.MEASURES.items():
+        screen.say(console, f"{name}: {said}")
+
+
+def _explained(console: Console, table: Table, words: Mapping[str, str]) -> None:
+    screen.show(console, table)
+    for name, said in words.items():
+        screen.say(console, f"{name}: {said}")
+
+
+def _table(rows: pl.DataFrame, by: str, title: str) -> Table:
+    """A row for each cell, a column for each value of `by`."""
+    printed = Table(title=title, box=box.SIMPLE)
+    heads = rows[by].unique(maintain_order=True).to_list()
+    for name in ("method", "N_T", *(head.replace("_", "\n") for head in heads)):
         printed.add_column(name, justify="left" if name == "method" else "right")
-    for (method, n_demos), cell in summary.group_by("method", "n_demos", maintain_order=True):
-        found = {row["measure"]: row for row in cell.iter_rows(named=True)}
-        cells = [_interval(found[each]) if each in found else "-" for each in measures]
+    for (method, n_demos), cell in rows.group_by("method", "n_demos", maintain_order=True):
+        of_head = {row[by]: row for row in cell.iter_rows(named=True)}
+        cells = [_interval(of_head[each]) if each in of_head else "-" for each in heads]
         printed.add_row(str(method), str(n_demos) if n_demos else "-", *cells)
     return printed
 

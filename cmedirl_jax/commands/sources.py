@@ -15,7 +15,7 @@ from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.ranges import Count, Size
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.load import load_policy
+from cmedirl_jax.runs.load import LearnedCell, learned_cell
 from cmedirl_jax.runs.storage import folder as run_folder
 
 
@@ -56,12 +56,25 @@ def policy(run: Path, method: str | None, seed: int, n_demos: int | None) -> Pol
     Raises:
         UserError: if there is no such run or policy, or there are several.
     """
-    config = run_folder.read(run)["config"]
-    if method is None and len(config["methods"]) > 1:
-        raise UserError(f"--method: {run} has several: {', '.join(config['methods'])}")
-    chosen: str = method or config["methods"][0]
+    found = learned(run, method, seed, n_demos)
     try:
-        return Policy(config["env"], chosen, load_policy(run, chosen, seed, n_demos))
+        act = found.policies().of(seed - found.cell.key.first_seed)
+    except ValueError as error:
+        raise UserError(" ".join(str(error).split())) from error
+    return Policy(found.task.id, found.method.name, act)
+
+
+def learned(run: Path, method: str | None, seed: int, n_demos: int | None) -> LearnedCell:
+    """What one of a run's learners has learned; its only method's if none is named.
+
+    Raises:
+        UserError: if there is no such run or learner, or there are several.
+    """
+    methods = run_folder.read(run)["config"]["methods"]
+    if method is None and len(methods) > 1:
+        raise UserError(f"--method: {run} has several: {', '.join(methods)}")
+    try:
+        return learned_cell(run, method or methods[0], seed, n_demos)
     except ValueError as error:
         raise UserError(" ".join(str(error).split())) from error
 

@@ -10,6 +10,7 @@ from cmedirl_jax.envs.host import HostEnv, from_gymnasium
 from cmedirl_jax.envs.registration import GYMNASIUM_NAMESPACE
 from cmedirl_jax.envs.registry import ENVS, find, make, register, split_id
 from cmedirl_jax.envs.validation import check
+from cmedirl_jax.envs.with_reward import with_reward
 
 __all__ = [
     "ENVS",
@@ -27,5 +28,6 @@ __all__ = [
     "split_id",
     "to_gymnasium",
     "to_gymnasium_vector",
+    "with_reward",
     "wrappers",
 ]

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,12 +16,17 @@ def partial(path: Path) -> Path:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a path to write to, which then replaces `path` in one move; an error leaves nothing."""
+    """Give a path to write a file or a folder to, which then replaces `path` in one move.
+
+    An error leaves nothing.
+    """
     written = partial(path)
     try:
         yield written
         replace(written, path)
     finally:
+        if written.is_dir():
+            shutil.rmtree(written)
         written.unlink(missing_ok=True)
 
 

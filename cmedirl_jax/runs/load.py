@@ -55,6 +55,11 @@ class LearnedCell(NamedTuple):
         """Whether the method has no networks: its policies and rewards are tables on a grid."""
         return self.method.tabular is not None and not self.method.interacts
 
+    @property
+    def has_rewards(self) -> bool:
+        """Whether the method has a reward of its own."""
+        return (self.cell.path / "rewards").exists()
+
     def policies(self) -> Functions:
         """Each seed's best policy, `(actor, observation [..., O]) -> action [..., A]`."""
         if self.only_tables:
@@ -77,7 +82,7 @@ class LearnedCell(NamedTuple):
         Raises:
             ValueError: if the method has no reward of its own.
         """
-        if not (self.cell.path / "rewards").exists():
+        if not self.has_rewards:
             raise ValueError(f"{self.method.name} learns no reward")
         if self.only_tables:
             states, actions = imitation.grids(self.task, self.settings.tabular)
@@ -128,7 +133,7 @@ def load_policy(
             damaged or of another version.
         OSError: if a file cannot be read.
     """
-    learned = _find(run, method, seed, n_demos, study)
+    learned = learned_cell(run, method, seed, n_demos, study)
     return learned.policies().of(seed - learned.cell.key.first_seed)
 
 
@@ -153,7 +158,7 @@ def load_reward(
         ValueError: as `load_policy`; and if the method has no reward of its own.
         OSError: if a file cannot be read.
     """
-    learned = _find(run, method, seed, n_demos, study)
+    learned = learned_cell(run, method, seed, n_demos, study)
     try:
         rewards = learned.rewards()
     except ValueError as error:
@@ -166,9 +171,10 @@ def _abstract(init: Callable[[jax.Array], Any]) -> Any:
     return jax.eval_shape(lambda: init(jax.random.key(0)))
 
 
-def _find(
-    run: str | Path, method: str, seed: int, n_demos: int | None, study: int | None
+def learned_cell(
+    run: str | Path, method: str, seed: int, n_demos: int | None = None, study: int | None = None
 ) -> LearnedCell:
+    """What the cell of a learner has learned; `load_policy` describes the arguments and errors."""
     finished = _finished(run)
 
     def matches(cell: SavedCell) -> bool:

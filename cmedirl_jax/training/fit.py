@@ -1,5 +1,6 @@
 """Training many seeds and evaluating them as they go, in one call."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -18,7 +19,7 @@ from cmedirl_jax.training.initialise import TrainingState
 from cmedirl_jax.training.methods import METHODS, Method
 from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.training.step import Log
-from cmedirl_jax.training.trainer import make
+from cmedirl_jax.training.trainer import Trainer, make
 from cmedirl_jax.types import EnvSpec
 
 
@@ -143,18 +144,39 @@ def fit(
 
     def learn(key: jax.Array) -> Result:
         state = trainer.init(key, task.data, task.n_demonstrations)
-        first = evaluate(state)
-
-        def chunk(state: TrainingState, steps: jax.Array):
-            state, log = trainer.run(state, task.data, steps)
-            return state, (evaluate(state), log)
-
-        chunks = jnp.arange(steps, dtype=jnp.int32).reshape(-1, evaluate_every)
-        state, (later, log) = jax.lax.scan(chunk, state, chunks)
-        evaluations = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), first, later)
-        return Result(state, evaluations, jax.tree.map(lambda x: x.reshape(steps), log))
+        return learn_and_evaluate(trainer, state, task.data, evaluate, steps, evaluate_every)
 
     group = seeds_lib.group_size(seeds, hidden=task.settings.architecture.hidden)
     keys = seeds_lib.keys(key, seeds_lib.padded(seeds, group))
     result = seeds_lib.map_groups(learn, group)(keys)
     return jax.tree.map(lambda x: x[:seeds], result)
+
+
+def learn_and_evaluate(
+    trainer: Trainer,
+    state: TrainingState,
+    data: HotStartData | None,
+    evaluate: Callable[[TrainingState], Evaluation],
+    steps: int,
+    evaluate_every: int,
+) -> Result:
+    """Train one seed from its first state, and evaluate it as it goes: leaves without seeds.
+
+    Args:
+        trainer: the method on the environment.
+        state: what its `init` gave.
+        data: the demonstrations; None for a method without.
+        evaluate: what is said of a state.
+        steps: environment steps; a multiple of `evaluate_every`.
+        evaluate_every: steps between evaluations.
+    """
+
+    def chunk(state: TrainingState, steps: jax.Array):
+        state, log = trainer.run(state, data, steps)
+        return state, (evaluate(state), log)
+
+    first = evaluate(state)
+    chunks = jnp.arange(steps, dtype=jnp.int32).reshape(-1, evaluate_every)
+    state, (later, log) = jax.lax.scan(chunk, state, chunks)
+    evaluations = jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), first, later)
+    return Result(state, evaluations, jax.tree.map(lambda x: x.reshape(steps), log))

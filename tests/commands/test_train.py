@@ -6,11 +6,14 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import polars as pl
 import pytest
 
 from cmedirl_jax.commands import train
 from cmedirl_jax.commands.cmedirl import main
+from cmedirl_jax.io import export
+from cmedirl_jax.runs import load_policy, load_reward
 from cmedirl_jax.training import tasks
 from tests.support import ROOT
 
@@ -19,6 +22,8 @@ SMALL = (
     *("--seeds", "2", "--max-steps", "240", "--evaluation-starts", "2", "--devices", "1"),
     *("--architecture.hidden", "16", "16", "--evaluate-every", "120", "--hot-start.steps", "20"),
 )
+PICTURES = ("slices", "agreement", "retraining")
+"""Of a task of three observations, which has no map."""
 COLLECT, REWARD = re.findall(r"```py\n(.*?)```", (ROOT / "docs/tutorial.md").read_text(), re.DOTALL)
 
 
@@ -58,9 +63,12 @@ def test_the_tutorials_last_program_prints_the_reward(run, capsys):
 
 
 def test_the_rewards_card_has_an_interval_for_each_measure(run, capsys):
-    assert main(["reward", str(run)]) == 0
+    carried = run.parent / "carried"
+    options = ("--export", str(carried), "--retrain", "12", "--licence", "CC0-1.0")
+    assert main(["reward", str(run), *options]) == 0
     output = capsys.readouterr().out
     assert "auc: how often a demonstrated step is paid more" in output
+    assert "-constant: 2 fresh agents, each under 1 physics" in output
     summary = pl.read_csv(run / "reward" / "summary.csv")
     measures = {"epic_uniform", "epic_visited", "dard_uniform", "dard_visited", "correlation"}
     # Every demonstration was the learners' to see, no end pays, and three observations are no grid.
@@ -69,6 +77,40 @@ def test_the_rewards_card_has_an_interval_for_each_measure(run, capsys):
     assert (summary["mean"] <= summary["high"]).all()
     rows = pl.read_parquet(run / "reward" / "seeds.parquet")
     assert rows["seed"].to_list() == [0, 1]
+    there = {path.name for path in (run / "reward").iterdir()}
+    pictures = {f"{name}.{kind}" for name in PICTURES for kind in ("png", "svg")}
+    tables = {"summary.csv", "importance.csv", "diagnostics.csv", "retraining.csv"}
+    tables |= {"seeds.parquet", "diagnostics.parquet", "retraining.parquet"}
+    assert there == pictures | tables | {"report.html"}
+    page = (run / "reward" / "report.html").read_text()
+    assert page.count("<img") == len(PICTURES)
+    importance = pl.read_csv(run / "reward" / "importance.csv")
+    assert set(importance["measure"]) == {*(f"observation[{i}]" for i in range(3)), "action[0]"}
+    fresh = pl.read_csv(run / "reward" / "retraining.csv")
+    assert set(fresh["method"]) == {"r_e", "random", "+constant", "-constant", "hs-me-ddpg"}
+    assert set(fresh["seeds"]) == {2}
+    # What was carried away is what the run holds.
+    exported = export.load(carried)
+    observation, action = np.zeros((4, 3), np.float32), np.full((4, 1), 0.5, np.float32)
+    reward = load_reward(run, "hs-me-ddpg", 0)(observation, action)
+    np.testing.assert_allclose(exported.functions["reward"](observation, action), reward, atol=1e-6)
+    policy = load_policy(run, "hs-me-ddpg", 0)(observation)
+    np.testing.assert_allclose(exported.functions["policy"](observation), policy, atol=1e-6)
+    card = exported.card
+    assert (card["task"], card["licence"], card["learner"]["seed"]) == ("Pendulum-v1", "CC0-1.0", 0)
+    assert card["report_card"]["auc"] == rows["auc"][0]
+    assert card["action"] == {"low": [-2.0], "high": [2.0]}
+
+
+def test_exports_that_cannot_be_are_refused_before_the_work(run, capsys):
+    def refused(*options):
+        assert main(["reward", str(run), *options]) == 2
+        return capsys.readouterr().err
+
+    assert f"--export: {run} exists; take another" in refused("--export", str(run))
+    assert "holds no method hs-me-ddpg, seed 9" in refused("--export", "new", "--seed", "9")
+    assert "--physics: says under what to retrain" in refused("--physics", "g=9.8")
+    assert not (run.parent.parent / "new").exists()
 
 
 def test_the_same_command_does_nothing_to_a_finished_run(run, capsys):

@@ -74,7 +74,7 @@ def panels(methods: Iterable[str]) -> tuple[Figure, dict[str, Axes]]:
 
 def label(method: str) -> str:
     """What a method is called in figures."""
-    return METHODS[method].label or method
+    return (METHODS[method].label if method in METHODS else None) or method
 
 
 def legend(figure: Figure, axes: Axes, columns: int = 3) -> None:

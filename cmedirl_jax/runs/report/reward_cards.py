@@ -1,35 +1,27 @@
 """Report cards of the rewards that a run has learned: what each knows of the true reward."""
 
 import functools
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import jax
 import numpy as np
 import polars as pl
 
-from cmedirl_jax import envs, normalisation
+from cmedirl_jax import normalisation
 from cmedirl_jax.assess import card, coverage
 from cmedirl_jax.assess.card import Rewards
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.runs import intervals
-from cmedirl_jax.runs.drawing import Figure
-from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.load import LearnedCell, learned_cells
-from cmedirl_jax.runs.report import reward_maps, reward_samples
-from cmedirl_jax.runs.report.reward_samples import Context, Sampled
-from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
-from cmedirl_jax.runs.storage import folder as run_folder
+from cmedirl_jax.runs.load import LearnedCell
+from cmedirl_jax.runs.report.reward_samples import Context, Judged, Sampled
 from cmedirl_jax.tabular import discretise
 
 COMPARED, DRAWS = 4_096, 64
 """Transitions that a reward is compared on, and draws that its canonical form averages over."""
 APART = 256
 """Steps of which the occupancies' distances are taken."""
-SHOWN = 16
-"""Steps of each seed that are drawn."""
 GRID = {1: 201, 2: 51}
 """Points along each dimension of one or two observations; more have no grid."""
 ACTIONS = 11
@@ -51,58 +43,10 @@ MEASURES = {
 """What is measured, in words."""
 
 
-class Cards(NamedTuple):
-    """What is said of a run's rewards.
-
-    Attributes:
-        rows: a row for each reward: method, n_demos, seed and the measures; null where there is
-            none.
-        maps: draws the rewards of the largest number of demonstrations; None for a task that cannot
-            be drawn.
-    """
-
-    rows: pl.DataFrame
-    maps: Callable[[], Figure] | None
-
-
-def of_run(folder: Path) -> Cards:
-    """The report cards of a run's rewards.
-
-    Raises:
-        UserError: if the folder holds no run, or one without demonstrations or rewards.
-    """
-    written = run_folder.read(folder)
-    config = written["config"]
-    pool = stored_demonstrations.load(folder)
-    if pool is None:
-        raise UserError(f"{folder}: the run has no demonstrations to assess a reward by")
-    try:
-        env, learned = envs.find(config["env"]), learned_cells(folder)
-        # Cells of older versions are found out here.
-        for cell in learned:
-            cell.policies()
-    except (LookupError, ValueError) as error:
-        raise UserError(f"{folder}: {' '.join(str(error).split())}") from error
-    rewarded = [cell for cell in learned if (cell.cell.path / "rewards").exists()]
-    if not rewarded:
-        raise UserError(f"{folder}: none of its methods learns a reward")
-    discount = config["settings"]["agent"]["discount"]
-    learners = max(cell.cell.key.seed_range.stop for cell in rewarded)
-    context = Context(env, pool, discount, learners, jax.random.key(config["seed"]))
-    sampled = [reward_samples.of_cell(context, cell) for cell in rewarded]
-    rows = [_of_cell(context, *each) for each in zip(rewarded, sampled, strict=True)]
-    most = max(cell.cell.key.n_demos for cell in rewarded)
-    shown = {
-        cell.method.name: reward_maps.Learned(
-            cell.rewards(), *(each.observation[:, :SHOWN].reshape(-1, 2) for each in one.seen)
-        )
-        for cell, one in zip(rewarded, sampled, strict=True)
-        if cell.cell.key.n_demos in (0, most) and reward_maps.fits(env)
-    }
-    return Cards(
-        pl.concat(rows, how="diagonal"),
-        functools.partial(reward_maps.maps, env, discount, shown) if shown else None,  # type: ignore[arg-type]
-    )
+def of_run(judged: Judged) -> pl.DataFrame:
+    """A row for each reward: method, n_demos, seed and the measures; null where there is none."""
+    cells = [_of_cell(judged.context, *each) for each in judged.cells]
+    return pl.concat(cells, how="diagonal")
 
 
 def _of_cell(context: Context, learned: LearnedCell, sampled: Sampled) -> pl.DataFrame:
@@ -179,7 +123,7 @@ def _coverages(
     context: Context, env: Env, sampled: Sampled
 ) -> Iterator[tuple[str, coverage.Coverage]]:
     """The coverage distributions by name, a draw for each seed; the visited one comes last."""
-    visited = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *sampled.seen)
+    visited = sampled.visited
     keys = jax.random.split(context.key, len(visited.reward))
     if normalisation.sensible(env.spec).all():
         draw = functools.partial(coverage.uniform, env=env, count=COMPARED, draws=DRAWS)
@@ -188,19 +132,24 @@ def _coverages(
     yield "visited", jax.jit(jax.vmap(draw))(keys, visited)
 
 
-def summarise(rows: pl.DataFrame, seeds: pl.DataFrame) -> pl.DataFrame:
+def summarise(
+    rows: pl.DataFrame, seeds: pl.DataFrame, measures: Mapping[str, str] = MEASURES
+) -> pl.DataFrame:
     """The mean of each measure over the seeds of each cell, with its 95% interval.
 
     Args:
-        rows: as `of_run` gives them.
+        rows: as `of_run` gives them, or others with a row for each learner; those of a column
+            `physics` are told apart by it.
         seeds: the run's table, whose `expert_id` says which seeds share an expert.
+        measures: the columns to summarise.
     """
     shared = ["method", "n_demos", "seed"]
     rows = rows.join(seeds.select(*shared, "expert_id"), on=shared, how="left")
+    labels = [name for name in ("method", "n_demos", "physics") if name in rows.columns]
     found = []
-    for (method, n_demos), cell in rows.group_by("method", "n_demos", maintain_order=True):
+    for values, cell in rows.group_by(labels, maintain_order=True):
         experts = cell["expert_id"]
-        for measure in MEASURES:
+        for measure in measures:
             if measure not in cell.columns or cell[measure].null_count():
                 continue
             interval = intervals.mean(
@@ -209,8 +158,7 @@ def summarise(rows: pl.DataFrame, seeds: pl.DataFrame) -> pl.DataFrame:
             )
             found.append(
                 {
-                    "method": method,
-                    "n_demos": n_demos,
+                    **dict(zip(labels, values, strict=True)),
                     "measure": measure,
                     "seeds": cell.height,
                     "mean": interval.estimate,

@@ -1,6 +1,7 @@
 """Pictures of learned rewards over a task's two observations, beside the task's own."""
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -12,6 +13,7 @@ from cmedirl_jax.envs import Env
 from cmedirl_jax.runs.drawing import Axes, Figure
 from cmedirl_jax.runs.load import Functions
 from cmedirl_jax.runs.report import curves
+from cmedirl_jax.runs.report.reward_samples import Judged
 from cmedirl_jax.tabular import discretise, interpolation
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.tabular.optimal_control import value_iteration
@@ -22,6 +24,10 @@ ACTIONS = 21
 """Points along the action, for the value of the optimum."""
 SHOWN = (0, ACTIONS // 2, ACTIONS - 1)
 """The actions that are shown: the least, the middle one and the largest."""
+
+
+STEPS = 16
+"""Steps of each seed that are drawn."""
 
 
 class Learned(NamedTuple):
@@ -46,6 +52,22 @@ def fits(env: Any) -> bool:
         and (env.spec.observation_dim, env.spec.action_dim) == (2, 1)
         and bool(normalisation.sensible(env.spec).all())
     )
+
+
+def of_run(judged: Judged) -> Callable[[], Figure] | None:
+    """Draws the rewards of the largest number of demonstrations; None if the task cannot be."""
+    env, discount = judged.context.env, judged.context.discount
+    if not isinstance(env, Env) or not fits(env):
+        return None
+    most = max(cell.cell.key.n_demos for cell, _ in judged.cells)
+    shown = {
+        cell.method.name: Learned(
+            cell.rewards(), *(each.observation[:, :STEPS].reshape(-1, 2) for each in sampled.seen)
+        )
+        for cell, sampled in judged.cells
+        if cell.cell.key.n_demos in (0, most)
+    }
+    return functools.partial(maps, env, discount, shown)
 
 
 def maps(env: Env, discount: float, learned: Mapping[str, Learned]) -> Figure:

@@ -1,16 +1,21 @@
-"""Steps of demonstrations and policies by which rewards are judged."""
+"""A run's rewards, and the steps of demonstrations and policies by which they are judged."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from cmedirl_jax import envs
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.runs.cells import pools, recording
-from cmedirl_jax.runs.load import LearnedCell
+from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.load import LearnedCell, learned_cells
+from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
+from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.types import DemonstrationSubset, Transition
 
 SAMPLED = 2_048
@@ -39,6 +44,49 @@ class Sampled(NamedTuple):
 
     seen: tuple[Transition, Transition]
     held_out: Transition | None
+
+    @property
+    def visited(self) -> Transition:
+        """The steps of demonstrations that were seen and of the policies together, `[seeds, N]`."""
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *self.seen)
+
+
+class Judged(NamedTuple):
+    """A run's rewards.
+
+    Attributes:
+        context: what they share.
+        cells: the finished cells that learned one, with the steps of each.
+    """
+
+    context: Context
+    cells: list[tuple[LearnedCell, Sampled]]
+
+
+def read(folder: Path) -> Judged:
+    """The rewards of a run, and steps to judge them by.
+
+    Raises:
+        UserError: if the folder holds no run, or one without demonstrations or rewards.
+    """
+    config: dict[str, Any] = run_folder.read(folder)["config"]
+    pool = stored_demonstrations.load(folder)
+    if pool is None:
+        raise UserError(f"{folder}: the run has no demonstrations to assess a reward by")
+    try:
+        env, learned = envs.find(config["env"]), learned_cells(folder)
+        # Cells of older versions are found out here.
+        for cell in learned:
+            cell.policies()
+    except (LookupError, ValueError) as error:
+        raise UserError(f"{folder}: {' '.join(str(error).split())}") from error
+    rewarded = [cell for cell in learned if cell.has_rewards]
+    if not rewarded:
+        raise UserError(f"{folder}: none of its methods learns a reward")
+    discount = config["settings"]["agent"]["discount"]
+    learners = max(cell.cell.key.seed_range.stop for cell in rewarded)
+    context = Context(env, pool, discount, learners, jax.random.key(config["seed"]))
+    return Judged(context, [(cell, of_cell(context, cell)) for cell in rewarded])
 
 
 def of_cell(context: Context, learned: LearnedCell) -> Sampled:

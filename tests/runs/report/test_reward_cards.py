@@ -57,17 +57,18 @@ def folder(tmp_path):
 
 
 def test_a_card_has_every_measure_of_the_car_and_a_map(folder):
-    cards = reward_cards.of_run(folder)
-    assert cards.rows.columns == ["method", "n_demos", "seed", *reward_cards.MEASURES]
-    assert cards.rows["seed"].to_list() == [0, 1]
-    assert cards.rows["method"].unique().to_list() == ["me-ddpg"]
+    judged = reward_samples.read(folder)
+    rows = reward_cards.of_run(judged)
+    assert rows.columns == ["method", "n_demos", "seed", *reward_cards.MEASURES]
+    assert rows["seed"].to_list() == [0, 1]
+    assert rows["method"].unique().to_list() == ["me-ddpg"]
     for name in ("epic_uniform", "dard_visited", "starc", "auc", "auc_held_out"):
-        assert cards.rows[name].is_between(0.0, 1.0).all()
+        assert rows[name].is_between(0.0, 1.0).all()
     # 100 at the goal makes loitering pay from 1.01 a step on.
-    expected = cards.rows["largest"] / 1.0101
-    np.testing.assert_allclose(cards.rows["loitering"], expected, rtol=1e-4)
-    assert cards.maps is not None
-    assert len(cards.maps().axes) >= 8
+    np.testing.assert_allclose(rows["loitering"], rows["largest"] / 1.0101, rtol=1e-4)
+    maps = reward_maps.of_run(judged)
+    assert maps is not None
+    assert len(maps().axes) >= 8
 
 
 def test_the_summary_has_an_interval_for_each_measure_of_each_cell():
@@ -94,7 +95,7 @@ def test_the_summary_has_an_interval_for_each_measure_of_each_cell():
 def test_runs_without_rewards_or_demonstrations_are_refused(untrained_run, tmp_path):
     run = shutil.copytree(untrained_run, tmp_path / "run")
     with pytest.raises(UserError, match="no demonstrations to assess"):
-        reward_cards.of_run(run)
+        reward_samples.read(run)
     stored_demonstrations.save(run, pools.scripted(3))
     with pytest.raises(UserError, match="none of its methods learns a reward"):
-        reward_cards.of_run(run)
+        reward_samples.read(run)

@@ -1,0 +1,68 @@
+"""Stable-baselines3 trains on a reward that was carried away, beside the task's own reward.
+
+    cmedirl reward results/tuned --export r_d --method hs-me-ddpg --seed 3
+    python -m pip install stable-baselines3
+    python examples/sb3_on_learned_reward.py r_d --seeds 10
+
+The reward is a file of numpy: of this library only the wrapper is used, and no JAX runs.
+"""
+
+import argparse
+import importlib.util
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+from stable_baselines3 import DDPG
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+
+from cmedirl_jax.envs.wrappers import LearnedReward
+
+
+def function_of(folder, name):
+    """The function of a file of Python in a folder that was exported."""
+    spec = importlib.util.spec_from_file_location(name, Path(folder) / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return getattr(module, name)
+
+
+def returns(task, reward, mode, seed, steps):
+    """Returns of r_e after every quarter of the training on a reward: [4]."""
+    env = gymnasium.make(task)
+    if mode != "r_e":
+        env = LearnedReward(env, reward, mode)
+    noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), 0.5 * np.ones(1))
+    agent = DDPG("MlpPolicy", env, seed=seed, action_noise=noise, learning_starts=200)
+    judge, found = gymnasium.make(task), []
+    judge.reset(seed=seed)
+    for _ in range(4):
+        agent.learn(steps // 4, reset_num_timesteps=False)
+        found.append(evaluate_policy(agent, judge, n_eval_episodes=10, warn=False)[0])
+    return found
+
+
+def main():
+    """Print the mean return after each quarter of the training, and how many seeds solve it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", help="what `cmedirl reward RUN --export` wrote")
+    parser.add_argument("--task", default="MountainCarContinuous-v0")
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--steps", type=int, default=12_000)
+    options = parser.parse_args()
+    reward = function_of(options.folder, "reward")
+    print("reward, seed: returns of r_e after each quarter")
+    for mode in ("r_e", "replace"):
+        found = []
+        for seed in range(options.seeds):
+            found.append(returns(options.task, reward, mode, seed, options.steps))
+            print(f"{mode}, {seed}: {' '.join(f'{one:.1f}' for one in found[-1])}", flush=True)
+        mean, last = np.mean(found, axis=0), np.array(found)[:, -1]
+        print(
+            f"{mode}, mean: {' '.join(f'{one:.1f}' for one in mean)}; {np.sum(last >= 90)} solved"
+        )
+
+
+if __name__ == "__main__":
+    main()
