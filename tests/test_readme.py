@@ -49,7 +49,8 @@ def test_readme_is_a_front_page():
 
 
 @pytest.mark.parametrize("code", EXAMPLES)
-def test_the_examples_run(code):
+def test_the_examples_run(code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     names = run(code)
     arrays = [leaf for leaf in jax.tree.leaves(list(names.values())) if isinstance(leaf, jax.Array)]
     numbers = [leaf for leaf in arrays if jnp.issubdtype(leaf.dtype, jnp.floating)]

@@ -22,14 +22,14 @@ from cmedirl_jax.commands import sources
 from cmedirl_jax.ranges import Size
 from cmedirl_jax.runs import carry, start
 from cmedirl_jax.runs.cluster.base import ClusterOptions
-from cmedirl_jax.runs.console import compile_cache, screen
+from cmedirl_jax.runs.console import compile_cache, screen, streams
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.report.base import Run
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import tables
 
 if TYPE_CHECKING:
-    from cmedirl_jax.runs.report.reward_report import Judgement
+    from cmedirl_jax.runs.report.reward_report import RewardReport
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,74 +53,81 @@ class Options(sources.PolicyOptions):
 def run(options: Options) -> int:
     """Run the command; returns its exit code."""
     folder, config = options.folder, run_folder.read(options.folder)["config"]
-    if options.physics and options.retrain is None:
-        raise UserError("--physics: says under what to retrain; give --retrain too")
+    _check_together(options)
     chosen = None
     if options.export is not None:
         chosen = sources.learned(folder, options.method, options.seed, options.n_demos)
         carry.check(options.export, chosen)
     compile_cache.use_cache()
-    devices = start.devices()
+    devices, plan = start.devices(), None
     if options.retrain is not None:
         devices = start.start(ClusterOptions(), None, config["seeds"], {})[1]
     # scipy takes a second to import: a refusal does not wait for it.
     from cmedirl_jax.runs.report import retrained, reward_report, reward_samples
 
     console = screen.console()
+    if options.retrain is not None:
+        plan = retrained.plan(
+            sources.task(config["env"]), options.retrain, options.physics, devices
+        )
     with run_folder.held(folder):
-        written = run_folder.read(folder)
-        run = Run(folder, config, run_folder.solved(folder, written), tables.read(folder, config))
-        judged, plan = reward_samples.read(folder), None
-        if options.retrain is not None:
-            plan = retrained.plan(
-                judged.context,
-                options.retrain,
-                options.physics,
-                judged.cells[0][0].settings,
-                devices,
-            )
-        found = reward_report.write(run, judged, plan, lambda line: screen.say(console, line))
-    _show(console, found)
+        solved = run_folder.solved(folder, run_folder.read(folder))
+        run = Run(folder, config, solved, tables.read(folder, config))
+        rewarded = reward_samples.read(folder)
+        if rewarded.diverged:
+            screen.say(console, f"{rewarded.diverged} learners diverged and are left out")
+        report = reward_report.write(
+            run, rewarded, plan, lambda line: screen.say(console, line), streams.complain
+        )
+    _show(console, report)
     screen.say(console, f"Report: {folder / run_folder.REWARD / 'report.html'}")
     if options.export is not None and chosen is not None:
-        carry.save(
-            options.export,
-            folder,
-            chosen,
-            options.seed,
-            licence=options.licence,
-            card=found.rows,
-            summary=found.summary,
-        )
+        words = {"licence": options.licence, "card": report.rows, "summary": report.summary}
+        carry.save(options.export, folder, chosen, options.seed, **words)
         screen.say(console, f"Reward and policy: {options.export}")
     return 0
 
 
-def _show(console: Console, found: "Judgement") -> None:
-    """Print what was found: tables, and what their columns are."""
+def _check_together(options: Options) -> None:
+    """Refuse options that would do nothing.
+
+    Raises:
+        UserError: naming the first.
+    """
+    if options.physics and options.retrain is None:
+        raise UserError("--physics: says under what to retrain; give --retrain too")
+    for name in ("method", "seed", "n_demos", "licence"):
+        default = Options.__dataclass_fields__[name].default
+        if options.export is None and getattr(options, name) != default:
+            raise UserError(f"--{name.replace('_', '-')}: says what to export; give --export too")
+
+
+def _show(console: Console, report: "RewardReport") -> None:
+    """Print the tables, and what their columns are."""
     from cmedirl_jax.runs.report import retrained, reward_cards, reward_diagnostics
 
-    title = f"{found.summary['seeds'].max()} seeds per row; 95% intervals"
-    _explained(console, _table(found.summary, "measure", title), reward_cards.MEASURES)
+    title = f"{report.summary['seeds'].max()} seeds per row; 95% intervals"
+    _explained(console, report.summary, "measure", title, reward_cards.MEASURES)
     # Of fewer than four learners there is no correlation.
-    if not found.trusted.is_empty():
+    if not report.correlations.is_empty():
         title = "rank correlation with the learners' return at the end; 95% intervals"
-        trusted = found.trusted.rename({"rank_correlation": "mean"})
-        _explained(console, _table(trusted, "diagnostic", title), reward_diagnostics.DIAGNOSTICS)
-    if found.retraining is None:
+        shown = report.correlations.with_columns(mean=pl.col("rank_correlation"))
+        _explained(console, shown, "diagnostic", title, reward_diagnostics.DIAGNOSTICS)
+    if report.retraining is None:
         return
-    for (physics,), rows in found.retraining.group_by("physics", maintain_order=True):
-        screen.show(
-            console, _table(rows, "measure", f"fresh agents on each reward, {physics} physics")
-        )
-    for name, said in retrained.MEASURES.items():
-        screen.say(console, f"{name}: {said}")
+    for (physics,), rows in report.retraining.group_by("physics", maintain_order=True):
+        title = f"fresh agents on each reward, {physics} physics"
+        _explained(console, rows, "measure", title, retrained.MEASURES)
+    if report.outdated is not None:
+        screen.say(console, report.outdated)
 
 
-def _explained(console: Console, table: Table, words: Mapping[str, str]) -> None:
-    screen.show(console, table)
-    for name, said in words.items():
-        screen.say(console, f"{name}: {said}")
+def _explained(
+    console: Console, rows: pl.DataFrame, by: str, title: str, words: Mapping[str, str]
+) -> None:
+    screen.show(console, _table(rows, by, title))
+    for name in rows[by].unique(maintain_order=True):
+        screen.say(console, f"{name}: {words[name]}")
 
 
 def _table(rows: pl.DataFrame, by: str, title: str) -> Table:

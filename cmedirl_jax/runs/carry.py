@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import polars as pl
 
-from cmedirl_jax.io import export
+from cmedirl_jax.io import atomic, export
 from cmedirl_jax.io.export import Function
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.load import Functions, LearnedCell
@@ -58,6 +58,10 @@ def check(folder: Path, learned: LearnedCell) -> None:
         )
     if folder.exists():
         raise UserError(f"--export: {folder} exists; take another folder, or remove it")
+    try:
+        atomic.check_writable(folder.parent)
+    except OSError as error:
+        raise UserError(f"--export: cannot write to {folder} ({error.strerror})") from error
     if not learned.has_rewards:
         raise UserError(f"--method: {learned.method.name} learns no reward")
 
@@ -90,7 +94,10 @@ def save(
 
     key, spec = learned.cell.key, learned.task
     mine = (pl.col("method") == key.method) & (pl.col("n_demos") == key.n_demos)
-    values = card.filter(mine, pl.col("seed") == seed).row(0, named=True)
+    own = card.filter(mine, pl.col("seed") == seed)
+    if own.is_empty():
+        raise UserError(f"--seed: learner {seed} of {key.method} has diverged")
+    values = own.row(0, named=True)
     over_seeds = summary.filter(mine).drop("method", "n_demos").to_dicts()
     description = {
         "task": spec.id,

@@ -64,7 +64,7 @@ def test_the_tutorials_last_program_prints_the_reward(run, capsys):
 
 def test_the_rewards_card_has_an_interval_for_each_measure(run, capsys):
     carried = run.parent / "carried"
-    options = ("--export", str(carried), "--retrain", "12", "--licence", "CC0-1.0")
+    options = ("--export", str(carried), "--retrain", "252", "--licence", "CC0-1.0")
     assert main(["reward", str(run), *options]) == 0
     output = capsys.readouterr().out
     assert "auc: how often a demonstrated step is paid more" in output
@@ -89,6 +89,11 @@ def test_the_rewards_card_has_an_interval_for_each_measure(run, capsys):
     fresh = pl.read_csv(run / "reward" / "retraining.csv")
     assert set(fresh["method"]) == {"r_e", "random", "+constant", "-constant", "hs-me-ddpg"}
     assert set(fresh["seeds"]) == {2}
+    agents = pl.read_parquet(run / "reward" / "retraining.parquet")
+    last = agents.filter(pl.col("env_step") == 252)
+    # Agents begin alike, and part with their rewards.
+    assert agents.filter(pl.col("env_step") == 0)["return_mean"].n_unique() == 2
+    assert last["return_mean"].n_unique() == last.height
     # What was carried away is what the run holds.
     exported = export.load(carried)
     observation, action = np.zeros((4, 3), np.float32), np.full((4, 1), 0.5, np.float32)
@@ -110,6 +115,7 @@ def test_exports_that_cannot_be_are_refused_before_the_work(run, capsys):
     assert f"--export: {run} exists; take another" in refused("--export", str(run))
     assert "holds no method hs-me-ddpg, seed 9" in refused("--export", "new", "--seed", "9")
     assert "--physics: says under what to retrain" in refused("--physics", "g=9.8")
+    assert "--licence: says what to export" in refused("--licence", "CC0-1.0")
     assert not (run.parent.parent / "new").exists()
 
 

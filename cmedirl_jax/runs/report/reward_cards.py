@@ -14,8 +14,7 @@ from cmedirl_jax.assess.card import Rewards
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.runs import intervals
-from cmedirl_jax.runs.load import LearnedCell
-from cmedirl_jax.runs.report.reward_samples import Context, Judged, Sampled
+from cmedirl_jax.runs.report.reward_samples import Context, Learners, RewardedRun
 from cmedirl_jax.tabular import discretise
 
 COMPARED, DRAWS = 4_096, 64
@@ -43,41 +42,34 @@ MEASURES = {
 """What is measured, in words."""
 
 
-def of_run(judged: Judged) -> pl.DataFrame:
+def of_run(run: RewardedRun) -> pl.DataFrame:
     """A row for each reward: method, n_demos, seed and the measures; null where there is none."""
-    cells = [_of_cell(judged.context, *each) for each in judged.cells]
-    return pl.concat(cells, how="diagonal")
+    return pl.concat([_of(run.context, each) for each in run.learners], how="diagonal")
 
 
-def _of_cell(context: Context, learned: LearnedCell, sampled: Sampled) -> pl.DataFrame:
-    """The rows of a cell."""
-    key = learned.cell.key
-    rewards, columns = Rewards(*learned.rewards()), {}
+def _of(context: Context, learners: Learners) -> pl.DataFrame:
+    rewards, columns = learners.rewards, {}
     # Against demonstrations.
-    told = jax.jit(lambda params: card.told(Rewards(rewards.reward, params), *sampled.seen))
-    columns |= {name: x for name, x in told(rewards.params)._asdict().items() if name != "smallest"}
-    if sampled.held_out is not None:
-        unseen = (sampled.held_out, sampled.seen[1])
-        again = jax.jit(lambda params: card.told(Rewards(rewards.reward, params), *unseen))
-        columns["auc_held_out"] = again(rewards.params).auc
+    told = jax.jit(lambda *args: card.told(Rewards(rewards.reward, args[0]), *args[1:]))
+    seen = told(rewards.params, learners.demonstrated, learners.played)._asdict()
+    columns |= {name: values for name, values in seen.items() if name != "smallest"}
+    if learners.held_out is not None:
+        unseen = told(rewards.params, learners.held_out, learners.played)
+        columns["auc_held_out"] = unseen.auc
     bonus = _bonus(context.pool)
     if bonus is not None:
         columns["loitering"] = columns["largest"] / card.loitering(context.discount, bonus)
     scale = _half_widths(context.env)
-    columns |= jax.jit(functools.partial(card.occupancies, context.key, scale))(
-        *(jax.tree.map(lambda leaf: leaf[:, :APART], each) for each in sampled.seen)
-    )._asdict()
+    apart = jax.jit(functools.partial(card.occupancies, context.key, scale))
+    few = (
+        jax.tree.map(lambda leaf: leaf[:, :APART], each)
+        for each in (learners.demonstrated, learners.played)
+    )
+    columns |= apart(*few)._asdict()
     # Against the task's own reward.
     if isinstance(context.env, Env) and context.env.state_at is not None:
-        columns |= _against_truth(context, context.env, rewards, sampled)
-    return pl.DataFrame(
-        {
-            "method": [key.method] * key.seeds,
-            "n_demos": [key.n_demos] * key.seeds,
-            "seed": list(key.seed_range),
-            **{name: np.asarray(columns[name], np.float64) for name in MEASURES if name in columns},
-        }
-    )
+        columns |= _against_truth(context, context.env, learners)
+    return learners.table({name: columns[name] for name in MEASURES if name in columns})
 
 
 def _bonus(pool: Demonstrations) -> float | None:
@@ -93,11 +85,10 @@ def _half_widths(env: Env | HostEnv) -> np.ndarray:
     return np.concatenate([normalisation.make(env.spec, "bounds").half_width, of_actions])
 
 
-def _against_truth(
-    context: Context, env: Env, rewards: Rewards, sampled: Sampled
-) -> dict[str, Any]:
+def _against_truth(context: Context, env: Env, learners: Learners) -> dict[str, Any]:
     columns: dict[str, Any] = {}
-    for name, made in _coverages(context, env, sampled):
+    rewards = learners.rewards
+    for name, made in _coverages(context, env, learners):
         found = jax.jit(
             lambda params, made: card.truth(
                 Rewards(rewards.reward, params), env, made, context.discount
@@ -120,10 +111,10 @@ def _against_truth(
 
 
 def _coverages(
-    context: Context, env: Env, sampled: Sampled
+    context: Context, env: Env, learners: Learners
 ) -> Iterator[tuple[str, coverage.Coverage]]:
     """The coverage distributions by name, a draw for each seed; the visited one comes last."""
-    visited = sampled.visited
+    visited = learners.visited
     keys = jax.random.split(context.key, len(visited.reward))
     if normalisation.sensible(env.spec).all():
         draw = functools.partial(coverage.uniform, env=env, count=COMPARED, draws=DRAWS)

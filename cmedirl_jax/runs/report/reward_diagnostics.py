@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 import scipy.stats
 
-LAST = 0.25
+LAST_SHARE = 0.25
 """Share of the evaluations by steps whose mean says how a learner performs at the end."""
 EVERY = "all"
 """The name of the rows over all methods."""
@@ -28,28 +28,29 @@ def of_learners(cards: pl.DataFrame, evaluations: pl.DataFrame) -> pl.DataFrame:
         evaluations: the run's table.
     """
     shared = ["method", "n_demos", "seed"]
+    # The last quarter of each learner's own evaluations; the only one of a method without steps.
+    order = pl.col("env_step").rank("dense").over(shared)
+    share = order / pl.col("env_step").n_unique().over(shared)
     of_training = (
-        evaluations.filter(pl.col("protocol") == "steps", pl.col("env_step") > 0)
-        .with_columns(
-            gap=pl.col("demonstration_reward") - pl.col("background_reward"),
-            later=pl.col("env_step").rank("dense") / pl.col("env_step").n_unique(),
-        )
-        .filter(pl.col("later") > 1.0 - LAST)
+        evaluations.filter(pl.col("protocol") == "steps")
+        .filter(share > 1.0 - LAST_SHARE)
+        .with_columns(gap=pl.col("demonstration_reward") - pl.col("background_reward"))
         .group_by(shared, maintain_order=True)
         .agg(
             pl.col("gap", "effective_sample_size").mean(),
             pl.col("return_mean").mean().alias("return"),
         )
     )
-    joined = cards.join(of_training, on=shared, how="inner")
+    joined = cards.join(of_training, on=shared, how="left")
     there = [name for name in DIAGNOSTICS if name in joined.columns]
     return joined.select(*shared, *there, "return")
 
 
-def trusted(learners: pl.DataFrame) -> pl.DataFrame:
+def correlations(learners: pl.DataFrame) -> pl.DataFrame:
     """Spearman's rank correlation of each diagnostic with the return, for each method and for all.
 
-    The 95% interval is Bonett and Wright's (2000).
+    The 95% interval is Bonett and Wright's (2000), which takes learners for independent. Over all
+    methods a correlation is mostly one of differences between methods.
 
     Args:
         learners: as `of_learners` gives them.
@@ -85,10 +86,10 @@ def trusted(learners: pl.DataFrame) -> pl.DataFrame:
                     "high": float(high),
                 }
             )
-    return pl.DataFrame(found, schema=_TRUSTED)
+    return pl.DataFrame(found, schema=_CORRELATIONS)
 
 
-_TRUSTED = {
+_CORRELATIONS = {
     "method": pl.String,
     "n_demos": pl.Int64,
     "diagnostic": pl.String,

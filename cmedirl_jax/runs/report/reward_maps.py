@@ -1,19 +1,19 @@
 """Pictures of learned rewards over a task's two observations, beside the task's own."""
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax import normalisation
+from cmedirl_jax.assess.card import Rewards
 from cmedirl_jax.envs import Env
 from cmedirl_jax.runs.drawing import Axes, Figure
-from cmedirl_jax.runs.load import Functions
 from cmedirl_jax.runs.report import curves
-from cmedirl_jax.runs.report.reward_samples import Judged
+from cmedirl_jax.runs.report.reward_samples import Learners, RewardedRun
 from cmedirl_jax.tabular import discretise, interpolation
 from cmedirl_jax.tabular.discretise import FiniteMDP
 from cmedirl_jax.tabular.optimal_control import value_iteration
@@ -30,20 +30,6 @@ STEPS = 16
 """Steps of each seed that are drawn."""
 
 
-class Learned(NamedTuple):
-    """What a method has learned.
-
-    Attributes:
-        rewards: of its seeds.
-        demonstrated: `[N, 2]`, observations of demonstrations.
-        played: `[M, 2]`, observations of its policies.
-    """
-
-    rewards: Functions
-    demonstrated: np.ndarray
-    played: np.ndarray
-
-
 def fits(env: Any) -> bool:
     """Whether a task can be drawn: two bounded observations, one action, and known dynamics."""
     return (
@@ -54,29 +40,23 @@ def fits(env: Any) -> bool:
     )
 
 
-def of_run(judged: Judged) -> Callable[[], Figure] | None:
+def of_run(run: RewardedRun) -> Callable[[], Figure] | None:
     """Draws the rewards of the largest number of demonstrations; None if the task cannot be."""
-    env, discount = judged.context.env, judged.context.discount
+    env = run.context.env
     if not isinstance(env, Env) or not fits(env):
         return None
-    most = max(cell.cell.key.n_demos for cell, _ in judged.cells)
-    shown = {
-        cell.method.name: Learned(
-            cell.rewards(), *(each.observation[:, :STEPS].reshape(-1, 2) for each in sampled.seen)
-        )
-        for cell, sampled in judged.cells
-        if cell.cell.key.n_demos in (0, most)
-    }
-    return functools.partial(maps, env, discount, shown)
+    most = max(learners.n_demos for learners in run.learners)
+    shown = [learners for learners in run.learners if learners.n_demos in (0, most)]
+    return functools.partial(maps, env, run.context.discount, shown)
 
 
-def maps(env: Env, discount: float, learned: Mapping[str, Learned]) -> Figure:
+def maps(env: Env, discount: float, learned: Sequence[Learners]) -> Figure:
     """A row for the task's own reward and the optimum's value, and a row for each method.
 
     Args:
         env: a task that `fits`.
         discount: gamma, of V*.
-        learned: by the method's name.
+        learned: of each method.
     """
     mdp = jax.jit(lambda: discretise.make(env, (POINTS, POINTS), (ACTIONS,)))()
     best = jax.jit(
@@ -94,22 +74,22 @@ def maps(env: Env, discount: float, learned: Mapping[str, Learned]) -> Figure:
     # The bonus at the end would hide all other differences.
     _row(figure, panels[0], mdp, np.clip(reward, None, 1.0), "$r_e$, at most 1", points)
     _map(figure, panels[0][3], mdp, np.asarray(best)[:-1], "$V^*$")
-    for axes, (method, each) in zip(panels[1:], learned.items(), strict=True):
+    for axes, each in zip(panels[1:], learned, strict=True):
         mean = np.asarray(_mean(each.rewards, mdp))
-        _row(figure, axes, mdp, mean, f"{curves.label(method)}, mean $r_D$", points)
+        _row(figure, axes, mdp, mean, f"{curves.label(each.method.name)}, mean $r_D$", points)
         _visits(axes[3], each)
     figure.supxlabel("first observation", fontsize=10)
     figure.supylabel("second observation", fontsize=10)
     return figure
 
 
-def _mean(rewards: Functions, mdp: FiniteMDP) -> jax.Array:
+def _mean(rewards: Rewards, mdp: FiniteMDP) -> jax.Array:
     """`[S, len(SHOWN)]`, the mean of the seeds' rewards."""
     states = jnp.asarray(interpolation.points(mdp.states))
     actions = jnp.asarray(interpolation.points(mdp.actions))[jnp.array(SHOWN)]
     pairs = jnp.broadcast_to(states[:, None], (len(states), len(SHOWN), 2))
     done = jnp.broadcast_to(actions[None], (len(states), len(SHOWN), 1))
-    every = jax.jit(lambda each: jax.lax.map(lambda one: rewards.function(one, pairs, done), each))
+    every = jax.jit(lambda each: jax.lax.map(lambda one: rewards.reward(one, pairs, done), each))
     return jnp.mean(every(rewards.params), axis=0)
 
 
@@ -149,11 +129,12 @@ def _draw(axes: Axes, mdp: FiniteMDP, values: np.ndarray, low: float, high: floa
     )
 
 
-def _visits(axes: Axes, learned: Learned) -> None:
-    for seen, colour, name in (
+def _visits(axes: Axes, learned: Learners) -> None:
+    for steps, colour, name in (
         (learned.demonstrated, curves.COLOURS[1], "demonstrations"),
         (learned.played, curves.COLOURS[0], "policies"),
     ):
+        seen = steps.observation[:, :STEPS].reshape(-1, 2)
         axes.plot(*seen.T, ".", color=colour, markersize=1.5, alpha=0.4, label=name)
     axes.set_title("visited", fontsize=9)
     axes.legend(loc="lower left", fontsize=7, markerscale=6, frameon=False)

@@ -1,4 +1,4 @@
-"""Write what is said of a run's rewards: tables, pictures and a page in RUN/reward."""
+"""The report on a run's rewards: tables, pictures and a page in RUN/reward."""
 
 import functools
 import io
@@ -20,7 +20,7 @@ from cmedirl_jax.runs.report import (
     reward_slices,
 )
 from cmedirl_jax.runs.report.base import Run
-from cmedirl_jax.runs.report.reward_samples import Judged
+from cmedirl_jax.runs.report.reward_samples import RewardedRun
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import outputs
 
@@ -35,79 +35,100 @@ CAPTIONS = {
 """What is written below each picture, in the page's order."""
 
 
-class Judgement(NamedTuple):
-    """What is said of a run's rewards.
+class RewardReport(NamedTuple):
+    """What is known of a run's rewards.
 
     Attributes:
         rows: a row for each reward.
-        summary: a row for each measure of each cell.
-        trusted: a row for each diagnostic of each cell.
-        retraining: a row for each measure of each cell's agents; None without.
+        summary: a row for each measure of each method.
+        correlations: a row for each diagnostic of each method.
+        retraining: a row for each measure of each method's agents; None without.
+        outdated: what the retraining lacks, or has and the run has not; None: nothing.
     """
 
     rows: pl.DataFrame
     summary: pl.DataFrame
-    trusted: pl.DataFrame
-    retraining: pl.DataFrame | None
+    correlations: pl.DataFrame
+    retraining: pl.DataFrame | None = None
+    outdated: str | None = None
 
 
 def write(
-    run: Run, judged: Judged, plan: retrained.Plan | None, say: Callable[[str], None]
-) -> Judgement:
-    """Judge a run's rewards, and write what was found.
+    run: Run,
+    rewarded: RewardedRun,
+    plan: retrained.Plan | None,
+    say: Callable[[str], None],
+    complain: Callable[[str], None],
+) -> RewardReport:
+    """Assess a run's rewards, and write what was found.
 
     Args:
         run: the run.
-        judged: its rewards.
+        rewarded: its rewards.
         plan: what to retrain; None: nothing. What was retrained before stays.
-        say: called with a line about what takes long, or cannot be drawn.
+        say: called with a line about what takes long.
+        complain: called with a line about a picture that cannot be drawn.
 
     Raises:
         OSError: if a file cannot be written.
     """
     to, seeds = run.folder / run_folder.REWARD, run.tables["seeds"]
-    shared = ["method", "n_demos", "seed"]
 
     # Each reward beside the task's, beside demonstrations, and beside those of other seeds.
-    agreement = reward_agreement.of_run(judged)
-    rows = reward_cards.of_run(judged).join(reward_agreement.rows(agreement), on=shared)
-    importances = reward_slices.importances(judged)
+    agreement = reward_agreement.of_run(rewarded)
+    shared = ["method", "n_demos", "seed"]
+    rows = reward_cards.of_run(rewarded).join(reward_agreement.rows(agreement), on=shared)
+    importances = reward_slices.importances(rewarded)
     learners = reward_diagnostics.of_learners(rows, run.tables["evaluations"])
     _parquet(to / "seeds.parquet", rows)
     _parquet(to / "diagnostics.parquet", learners)
-    found = Judgement(
+    report = RewardReport(
         rows,
         _csv(to / "summary.csv", reward_cards.summarise(rows, seeds)),
-        _csv(to / "diagnostics.csv", reward_diagnostics.trusted(learners)),
-        None,
+        _csv(to / "diagnostics.csv", reward_diagnostics.correlations(learners)),
     )
-    names = {name: name for name in reward_slices.inputs(judged.context.env)}
+    names = {name: name for name in reward_slices.inputs(rewarded.context.env)}
     _csv(to / "importance.csv", reward_cards.summarise(importances, seeds, names))
     figures: dict[str, Callable[[], Figure]] = {
-        "slices": reward_slices.figure(judged, importances),
+        "slices": reward_slices.figure(rewarded, importances),
         "agreement": functools.partial(reward_agreement.figure, agreement),
     }
-    if (maps := reward_maps.of_run(judged)) is not None:
+    if (maps := reward_maps.of_run(rewarded)) is not None:
         figures["maps"] = maps
 
     # Fresh agents.
     agents = to / "retraining.parquet"
     if plan is not None:
-        _parquet(agents, retrained.of_cells(judged.context, plan, judged.cells, say))
+        _parquet(agents, retrained.of_run(rewarded, plan, say))
     if agents.is_file():
         evaluations = pl.read_parquet(agents)
         measured = retrained.measured(evaluations)
         summary = reward_cards.summarise(measured, seeds, retrained.MEASURES)
-        found = found._replace(retraining=_csv(to / "retraining.csv", summary))
-        threshold = judged.context.env.spec.reward_threshold
-        figures["retraining"] = functools.partial(retrained.figure, evaluations, threshold)
+        report = report._replace(
+            retraining=_csv(to / "retraining.csv", summary),
+            outdated=_outdated(rows, evaluations),
+        )
+        threshold = rewarded.context.env.spec.reward_threshold
+        figures["retraining"] = functools.partial(retrained.figure, evaluations, seeds, threshold)
 
-    # Pictures and markup.
-    for name, figure in figures.items():
-        drawing.save(figure, [to / f"{name}.png", to / f"{name}.svg"], say)
-    pictures = {name: to / f"{name}.png" for name in CAPTIONS if name in figures}
-    outputs.write(to / "report.html", _page(run, found, pictures).encode())
-    return found
+    # Pictures and page.
+    pictures = {
+        name: to / f"{name}.png"
+        for name, figure in figures.items()
+        if drawing.save(figure, [to / f"{name}.png", to / f"{name}.svg"], complain)
+    }
+    outputs.write(to / "report.html", _page(run, report, pictures).encode())
+    return report
+
+
+def _outdated(rows: pl.DataFrame, evaluations: pl.DataFrame) -> str | None:
+    """How the rewards that were retrained differ from those of the run."""
+    shared = ["method", "n_demos", "seed"]
+    missing = rows.join(evaluations, on=shared, how="anti")
+    if missing.is_empty():
+        return None
+    methods = ", ".join(missing["method"].unique(maintain_order=True))
+    return f"Rewards that came later have no fresh agents: {methods}; give --retrain again."
 
 
 def _parquet(path: Path, table: pl.DataFrame) -> None:
@@ -121,40 +142,41 @@ def _csv(path: Path, table: pl.DataFrame) -> pl.DataFrame:
     return table
 
 
-def _page(run: Run, found: Judgement, pictures: dict[str, Path]) -> str:
+def _page(run: Run, report: RewardReport, pictures: dict[str, Path]) -> str:
     title = f"The learned rewards of {run.config['env']}"
     parts = [
         f"<h1>{markup.text(title)}</h1>",
         "<p>Means over the learners; brackets are 95% intervals.</p>",
         "<h2>What the rewards know</h2>",
-        _by_cell(found.summary, "measure", ("mean", "low", "high")),
+        _table(report.summary, "measure", ("mean", "low", "high")),
         markup.definitions(reward_cards.MEASURES),
-        "<h2>What tells how a learner performs</h2>",
-        "<p>Spearman's rank correlation of each diagnostic with the learners' return in the last "
-        "quarter of their evaluations.</p>",
-        _by_cell(found.trusted, "diagnostic", ("rank_correlation", "low", "high")),
-        markup.definitions(reward_diagnostics.DIAGNOSTICS),
     ]
-    if found.retraining is not None:
+    if not report.correlations.is_empty():
+        parts += [
+            "<h2>What tells how a learner performs</h2>",
+            "<p>Spearman's rank correlation of each diagnostic with the learners' return in the "
+            "last quarter of their evaluations.</p>",
+            _table(report.correlations, "diagnostic", ("rank_correlation", "low", "high")),
+            markup.definitions(reward_diagnostics.DIAGNOSTICS),
+        ]
+    if report.retraining is not None:
         parts.append("<h2>Fresh agents on each reward alone</h2>")
-        for (physics,), rows in found.retraining.group_by("physics", maintain_order=True):
+        parts.append(f"<p>{markup.text(report.outdated)}</p>" if report.outdated else "")
+        for (physics,), rows in report.retraining.group_by("physics", maintain_order=True):
             parts.append(f"<h3>{markup.text(physics)} physics</h3>")
-            parts.append(_by_cell(rows, "measure", ("mean", "low", "high")))
+            parts.append(_table(rows, "measure", ("mean", "low", "high")))
         parts.append(markup.definitions(retrained.MEASURES))
-    parts += [markup.figure(path, CAPTIONS[name]) for name, path in pictures.items()]
+    shown = [name for name in CAPTIONS if name in pictures]
+    parts += [markup.figure(pictures[name], CAPTIONS[name]) for name in shown]
     return markup.document(title, parts)
 
 
-def _by_cell(rows: pl.DataFrame, by: str, columns: tuple[str, str, str]) -> str:
-    """A row for each cell, a column for each value of `by`, as a number with its interval."""
+def _table(rows: pl.DataFrame, by: str, columns: tuple[str, str, str]) -> str:
+    """A row for each method, a column for each value of `by`, as a number with its interval."""
     heads = rows[by].unique(maintain_order=True).to_list()
     body = []
-    for (method, n_demos), cell in rows.group_by("method", "n_demos", maintain_order=True):
-        of_head = {row[by]: row for row in cell.iter_rows(named=True)}
-        values = (
-            [of_head[head][column] for column in columns] if head in of_head else [None]
-            for head in heads
-        )
+    for (method, n_demos), of_method in rows.group_by("method", "n_demos", maintain_order=True):
+        of_head = {row[by]: [row[column] for column in columns] for row in of_method.to_dicts()}
         name = markup.name(str(method), f"{n_demos} demonstrations" if n_demos else None)
-        body.append([name, *(markup.interval(each) for each in values)])
+        body.append([name, *(markup.interval(of_head.get(head, [None])) for head in heads)])
     return markup.table(["method", *(head.replace("_", " ") for head in heads)], body)

@@ -13,7 +13,7 @@ from cmedirl_jax.assess.card import Rewards
 from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.runs.drawing import Figure
 from cmedirl_jax.runs.report import curves
-from cmedirl_jax.runs.report.reward_samples import Judged
+from cmedirl_jax.runs.report.reward_samples import Learners, RewardedRun
 
 STEPS, POINTS = 32, 41
 """Demonstrated steps of each seed that are sliced through, and points of a slice."""
@@ -39,63 +39,50 @@ def inputs(env: Env | HostEnv) -> list[str]:
     return [f"{name}[{index}]" for name, size in sizes for index in range(size)]
 
 
-def importances(judged: Judged) -> pl.DataFrame:
+def importances(run: RewardedRun) -> pl.DataFrame:
     """How much each reward depends on each input, on what its demonstrations and policy visit."""
-    names, parts = inputs(judged.context.env), []
-    for cell, sampled in judged.cells:
-        rewards, key = Rewards(*cell.rewards()), cell.cell.key
+    names, parts = inputs(run.context.env), []
+    for learners in run.learners:
         measure = jax.jit(
-            lambda params, steps, pay=rewards.reward: importance.permutation(
-                judged.context.key, Rewards(pay, params), steps
+            lambda params, steps, pay=learners.rewards.reward: importance.permutation(
+                run.context.key, Rewards(pay, params), steps
             )
         )
-        found = np.asarray(measure(rewards.params, sampled.visited), np.float64)
-        labels = {"method": [key.method] * key.seeds, "n_demos": [key.n_demos] * key.seeds}
-        columns = dict(zip(names, found.T, strict=True))
-        parts.append(pl.DataFrame(labels | {"seed": list(key.seed_range)} | columns))
+        found = np.asarray(measure(learners.rewards.params, learners.visited))
+        parts.append(learners.table(dict(zip(names, found.T, strict=True))))
     return pl.concat(parts)
 
 
-def of_cell(rewards: Rewards, demonstrated: np.ndarray, column: int, size: int) -> Slice:
-    """A slice along one input.
-
-    Args:
-        rewards: of the cell's seeds.
-        demonstrated: `[seeds, N, O + A]`, demonstrated steps.
-        column: which input.
-        size: O.
-    """
-    low, high = np.percentile(demonstrated[..., column], [1.0, 99.0])
+def of_learners(learners: Learners, column: int) -> Slice:
+    """A slice of their rewards along one input."""
+    shown, size = learners.demonstrated, learners.demonstrated.observation.shape[-1]
+    steps = np.concatenate([shown.observation, shown.action], axis=-1)
+    low, high = np.percentile(steps[..., column], [1.0, 99.0])
     at = np.linspace(low, high, POINTS, dtype=np.float32)
-    steps = np.repeat(demonstrated[:, :STEPS, None], POINTS, axis=2)
+    steps = np.repeat(steps[:, :STEPS, None], POINTS, axis=2)
     steps[..., column] = at
-    paid = jax.jit(jax.vmap(rewards.reward))(rewards.params, steps[..., :size], steps[..., size:])
+    pay = jax.jit(jax.vmap(learners.rewards.reward))
+    paid = pay(learners.rewards.params, steps[..., :size], steps[..., size:])
     return Slice(at, np.asarray(jnp.mean(paid, axis=1)))
 
 
-def figure(judged: Judged, importances: pl.DataFrame) -> Callable[[], Figure]:
-    """Draws a row for each cell and a column for each of the most important inputs."""
-    spec, names = judged.context.env.spec, inputs(judged.context.env)
-    mean = importances.select(names).mean().row(0)
-    chosen = sorted(np.argsort(mean)[::-1][:MOST].tolist())
+def figure(run: RewardedRun, importances: pl.DataFrame) -> Callable[[], Figure]:
+    """Draws a row for each method and a column for each of the most important inputs."""
+    names = inputs(run.context.env)
+    chosen = sorted(np.argsort(importances.select(names).mean().row(0))[::-1][:MOST].tolist())
+    slices = [[of_learners(each, column) for column in chosen] for each in run.learners]
 
     def draw() -> Figure:
-        drawn = Figure(
-            figsize=(2.3 * len(chosen) + 1.0, 1.9 * len(judged.cells)), layout="constrained"
-        )
-        panels = drawn.subplots(
-            len(judged.cells), len(chosen), sharex="col", sharey="row", squeeze=False
-        )
-        for row, (cell, sampled) in zip(panels, judged.cells, strict=True):
-            rewards, (shown, _) = Rewards(*cell.rewards()), sampled.seen
-            demonstrated = np.concatenate([shown.observation, shown.action], axis=-1)
-            for axes, column in zip(row, chosen, strict=True):
-                one = of_cell(rewards, demonstrated, column, spec.observation_dim)
+        size = (2.3 * len(chosen) + 1.0, 1.9 * len(slices))
+        drawn = Figure(figsize=size, layout="constrained")
+        panels = drawn.subplots(len(slices), len(chosen), sharex="col", sharey="row", squeeze=False)
+        for row, learners, of_method in zip(panels, run.learners, slices, strict=True):
+            for axes, one in zip(row, of_method, strict=True):
                 low, high = np.percentile(one.reward, [5.0, 95.0], axis=0)
                 axes.fill_between(one.at, low, high, color=curves.COLOURS[0], alpha=0.2, lw=0)
                 axes.plot(one.at, one.reward.mean(axis=0), color=curves.COLOURS[0])
                 axes.tick_params(labelsize=7)
-            row[0].set_ylabel(curves.label(cell.method.name), fontsize=8)
+            row[0].set_ylabel(learners.name, fontsize=8)
         for axes, column in zip(panels[-1], chosen, strict=True):
             axes.set_xlabel(names[column], fontsize=8)
         return drawn

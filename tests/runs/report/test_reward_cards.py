@@ -8,7 +8,13 @@ import polars as pl
 import pytest
 
 from cmedirl_jax.runs.errors import UserError
-from cmedirl_jax.runs.report import reward_cards, reward_maps, reward_samples
+from cmedirl_jax.runs.report import (
+    reward_agreement,
+    reward_cards,
+    reward_maps,
+    reward_samples,
+    reward_slices,
+)
 from cmedirl_jax.runs.storage import cells, plain
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.runs.storage.cells import CellKey
@@ -35,7 +41,7 @@ def small(monkeypatch):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A run of two untrained learners, each with an expert of two episodes."""
+    """A run of two untrained learners in two blocks, each with an expert of two episodes."""
     curves.write_config(tmp_path, methods=("me-ddpg", "ddpg"), n_demos=(2,), seeds=SEEDS)
     pool = pools.scripted(4)
     experts = {"expert": "each", "experts_demonstrating": [0, 1], "experts_trained": 2}
@@ -50,15 +56,17 @@ def folder(tmp_path):
     }
     description = {"task": plain.plain(pools.ENV.spec), "settings": plain.plain(settings)}
     for method, n_demos in (("me-ddpg", 2), ("ddpg", 0)):
-        key = CellKey(0, "each", method, n_demos, 0, SEEDS)
-        own = trees if n_demos else {"policies": trees["policies"]}
-        cells.save(tmp_path, key, description, cells_of.rows(key), own)
+        for first in range(SEEDS):
+            key = CellKey(0, "each", method, n_demos, first, 1)
+            own = jax.tree.map(lambda leaf, first=first: leaf[first : first + 1], trees)
+            own = own if n_demos else {"policies": own["policies"]}
+            cells.save(tmp_path, key, description, cells_of.rows(key), own)
     return tmp_path
 
 
 def test_a_card_has_every_measure_of_the_car_and_a_map(folder):
-    judged = reward_samples.read(folder)
-    rows = reward_cards.of_run(judged)
+    run = reward_samples.read(folder)
+    rows = reward_cards.of_run(run)
     assert rows.columns == ["method", "n_demos", "seed", *reward_cards.MEASURES]
     assert rows["seed"].to_list() == [0, 1]
     assert rows["method"].unique().to_list() == ["me-ddpg"]
@@ -66,7 +74,12 @@ def test_a_card_has_every_measure_of_the_car_and_a_map(folder):
         assert rows[name].is_between(0.0, 1.0).all()
     # 100 at the goal makes loitering pay from 1.01 a step on.
     np.testing.assert_allclose(rows["loitering"], rows["largest"] / 1.0101, rtol=1e-4)
-    maps = reward_maps.of_run(judged)
+    (agreement,) = reward_agreement.of_run(run)
+    assert agreement.distance.shape == (2, 2)
+    importances = reward_slices.importances(run)
+    assert importances["seed"].to_list() == [0, 1]
+    assert len(reward_slices.figure(run, importances)().axes) == 3
+    maps = reward_maps.of_run(run)
     assert maps is not None
     assert len(maps().axes) >= 8
 

@@ -1,5 +1,8 @@
 """What is said of a run's rewards beside their cards."""
 
+from typing import NamedTuple
+
+import flax.struct
 import numpy as np
 import polars as pl
 import pytest
@@ -14,8 +17,8 @@ from cmedirl_jax.runs.report import (
     reward_diagnostics,
 )
 from cmedirl_jax.runs.report.reward_agreement import Agreement
-from cmedirl_jax.runs.report.reward_samples import Context
-from cmedirl_jax.runs.storage.cells import CellKey
+from cmedirl_jax.runs.report.reward_samples import Learners
+from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.settings import Settings
 
 CAR = envs.make("MountainCarContinuous-v0")
@@ -26,8 +29,8 @@ def evaluations(returns, gaps):
     """Evaluations of four steps each; the first three say nothing of the end."""
     rows = []
     for seed, (last, gap) in enumerate(zip(returns, gaps, strict=True)):
-        for step in range(5):
-            at_end = step == 4
+        for step in range(4):
+            at_end = step == 3
             learned = {"demonstration_reward": gap, "background_reward": 0.0}
             row = {"protocol": "steps", "seed": seed, "env_step": 10 * step}
             row |= {"return_mean": last if at_end else -99.0, "effective_sample_size": 3.0}
@@ -42,7 +45,7 @@ def test_a_diagnostic_is_ranked_with_the_return_at_the_end():
     learners = reward_diagnostics.of_learners(cards, evaluations(returns, gaps))
     assert learners["return"].to_list() == returns
     assert learners["gap"].to_list() == gaps
-    found = reward_diagnostics.trusted(learners)
+    found = reward_diagnostics.correlations(learners)
     # The effective sample size does not vary, and tells nothing.
     assert found.select("method", "diagnostic").rows() == [
         (method, name) for method in ("all", "me-ddpg") for name in ("gap", "auc")
@@ -60,21 +63,25 @@ def test_the_interval_covers_the_correlation_of_normal_pairs():
         x, noise = rng.normal(size=(2, 60))
         rows = pl.DataFrame({"auc": x, "return": 0.5 * x + np.sqrt(0.75) * noise})
         rows = rows.with_columns(method=pl.lit("gail"), n_demos=pl.lit(5))
-        low, high = reward_diagnostics.trusted(rows).select("low", "high").row(0)
+        low, high = reward_diagnostics.correlations(rows).select("low", "high").row(0)
         covered += low <= true <= high
     assert 0.91 <= covered / 300 <= 0.99
 
 
+def learners(seeds, method="gail"):
+    """Learners whose rewards and steps do not matter."""
+    return Learners(METHODS[method], 5, Settings(), np.array(seeds), *[None] * 4)
+
+
 def test_disagreement_is_the_mean_distance_to_the_others():
-    distance = np.array([[0.0, 0.2, 0.4], [0.2, 0.0, 0.6], [0.4, 0.6, 0.0]])
-    found = [Agreement(CellKey(0, "each", "gail", 5, 4, 3), distance)]
+    # The last reward is a constant, which is unrelated even to itself.
+    distance = np.array([[0.0, 0.2, 0.7], [0.2, 0.0, 0.7], [0.7, 0.7, 0.7]])
+    found = [Agreement(learners([4, 5, 9]), distance)]
     rows = reward_agreement.rows(found)
-    assert rows["seed"].to_list() == [4, 5, 6]
-    assert rows["disagreement"].to_list() == pytest.approx([0.3, 0.4, 0.5])
+    assert rows["seed"].to_list() == [4, 5, 9]
+    assert rows["disagreement"].to_list() == pytest.approx([0.45, 0.45, 0.7])
     assert len(reward_agreement.figure(found).axes) == 2
-    alone = reward_agreement.rows(
-        [Agreement(CellKey(0, "each", "gail", 5, 0, 1), np.zeros((1, 1)))]
-    )
+    alone = reward_agreement.rows([Agreement(learners([0]), np.zeros((1, 1)))])
     assert alone["disagreement"].to_list() == [None]
 
 
@@ -96,13 +103,12 @@ def test_agents_are_measured_at_the_end_against_those_on_the_tasks_reward():
     summary = reward_cards.summarise(agents, seeds, retrained.MEASURES)
     assert summary.height == 2 * 2 * len(retrained.MEASURES)
     assert summary["seeds"].to_list() == [2] * summary.height
-    figure = retrained.figure(pl.DataFrame(rows), 90.0)
+    figure = retrained.figure(pl.DataFrame(rows), seeds, 90.0)
     assert [axes.get_title() for axes in figure.axes] == ["own physics", "power=2"]
 
 
 def planned(*changes, steps=120, env=CAR):
-    context = Context(env, None, 0.99, 2, None)
-    return retrained.plan(context, steps, changes, Settings(), [])
+    return retrained.plan(env, steps, changes, [])
 
 
 def test_physics_are_changed_by_name():
@@ -126,6 +132,7 @@ def test_physics_are_changed_by_name():
         (("power=much",), "power=much gives no number as 0.0015 is"),
         (("power=inf",), "power=inf is not finite"),
         (("max_episode_steps=1.5",), "gives no number as 999 is"),
+        ((f"max_episode_steps={10**30}",), "gives no number as 999 is"),
     ],
 )
 def test_other_physics_are_refused(changes, said):
@@ -136,8 +143,40 @@ def test_other_physics_are_refused(changes, said):
 def test_what_cannot_be_retrained_is_refused():
     with pytest.raises(UserError, match="--retrain: 100 is no multiple of 12"):
         planned(steps=100)
-    with pytest.raises(UserError, match="goal is 2 numbers"):
+    with pytest.raises(UserError, match="goal is no single number"):
         planned("goal=1", env=envs.make("PointMass-v0"))
+
+
+def test_physics_of_any_dataclass_and_tuple():
+    class Pair(NamedTuple):
+        mass: float = 1.0
+        heavy: bool = False
+
+    @flax.struct.dataclass
+    class Fields:
+        mass: float = 1.0
+
+    tasks = [CAR._replace(default_params=params) for params in (Pair(), Fields())]
+    found = [planned("mass=2", env=env).physics["mass=2"].mass for env in tasks]
+    assert found == [2.0, 2.0]
+    with pytest.raises(UserError, match="heavy is no single number"):
+        planned("heavy=True", env=tasks[0])
+    with pytest.raises(UserError, match="parameters: none"):
+        planned("mass=2", env=CAR._replace(default_params=()))
+
+
+def test_a_learner_that_ended_early_is_judged_by_its_own_evaluations():
+    table = evaluations([10.0, 20.0, 30.0, 40.0], [1.0, 2.0, 3.0, 4.0])
+    early = pl.col("seed") == 0
+    table = table.with_columns(
+        env_step=pl.when(early).then(pl.col("env_step") // 10).otherwise(pl.col("env_step"))
+    )
+    cards = table.select("method", "n_demos", "seed").unique(maintain_order=True)
+    found = reward_diagnostics.of_learners(cards, table)
+    assert found["return"].to_list() == [10.0, 20.0, 30.0, 40.0]
+    # A method without steps has one evaluation.
+    table = table.filter(pl.col("env_step") == 0)
+    assert reward_diagnostics.of_learners(cards, table)["return"].to_list() == [-99.0] * 4
 
 
 def test_a_page_escapes_what_it_shows():
