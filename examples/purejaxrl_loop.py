@@ -34,7 +34,6 @@ def make_train(env, reward, *, envs=32, steps=25, updates=150, discount=0.97, ra
 
     def train(key):
         key, actor_key, critic_key, reset_key = jax.random.split(key, 4)
-        nothing = jnp.zeros((1, env.spec.action_dim))
         weights = (networks.actor.init(actor_key), networks.critic.init(critic_key))
         start = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(reset_key, envs), params)
 
@@ -62,9 +61,8 @@ def make_train(env, reward, *, envs=32, steps=25, updates=150, discount=0.97, ra
 
         def loss(weights, batch, last):
             def value(observation):
-                return networks.critic.apply(
-                    weights[1], observation, jnp.broadcast_to(nothing, (*observation.shape[:-1], 2))
-                )
+                size = (*observation.shape[:-1], env.spec.action_dim)
+                return networks.critic.apply(weights[1], observation, jnp.zeros(size))
 
             def back(after, step):
                 now = step.reward + discount * jnp.where(step.done, 0.0, after)

@@ -4,11 +4,12 @@
     python -m pip install stable-baselines3
     python examples/sb3_on_learned_reward.py r_d --seeds 10
 
-The reward is a file of numpy: of this library only the wrapper is used, and no JAX runs.
+The reward is a file of numpy: of this library only the wrapper for Gymnasium's task is used.
 """
 
 import argparse
 import importlib.util
+import json
 from pathlib import Path
 
 import gymnasium
@@ -33,7 +34,8 @@ def returns(task, reward, mode, seed, steps):
     env = gymnasium.make(task)
     if mode != "r_e":
         env = LearnedReward(env, reward, mode)
-    noise = OrnsteinUhlenbeckActionNoise(np.zeros(1), 0.5 * np.ones(1))
+    zeros = np.zeros(env.action_space.shape)
+    noise = OrnsteinUhlenbeckActionNoise(zeros, zeros + 0.5)
     agent = DDPG("MlpPolicy", env, seed=seed, action_noise=noise, learning_starts=200)
     judge, found = gymnasium.make(task), []
     judge.reset(seed=seed)
@@ -47,21 +49,21 @@ def main():
     """Print the mean return after each quarter of the training, and how many seeds solve it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", help="what `cmedirl reward RUN --export` wrote")
-    parser.add_argument("--task", default="MountainCarContinuous-v0")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--steps", type=int, default=12_000)
     options = parser.parse_args()
     reward = function_of(options.folder, "reward")
+    task = json.loads((Path(options.folder) / "card.json").read_text())["task"]
+    solved = gymnasium.make(task).spec.reward_threshold
     print("reward, seed: returns of r_e after each quarter")
     for mode in ("r_e", "replace"):
         found = []
         for seed in range(options.seeds):
-            found.append(returns(options.task, reward, mode, seed, options.steps))
+            found.append(returns(task, reward, mode, seed, options.steps))
             print(f"{mode}, {seed}: {' '.join(f'{one:.1f}' for one in found[-1])}", flush=True)
         mean, last = np.mean(found, axis=0), np.array(found)[:, -1]
-        print(
-            f"{mode}, mean: {' '.join(f'{one:.1f}' for one in mean)}; {np.sum(last >= 90)} solved"
-        )
+        counted = "" if solved is None else f"; {np.sum(last >= solved)} solved at last"
+        print(f"{mode}, mean: {' '.join(f'{one:.1f}' for one in mean)}{counted}")
 
 
 if __name__ == "__main__":

@@ -95,7 +95,9 @@ def retrain(
         return learn_and_evaluate(made, state, None, evaluate, steps, evaluate_every).evaluations
 
     # Every reward under every physics, in groups that fit the cache.
-    worlds = jax.tree.leaves(physics)[0].shape[0]
+    leaves = jax.tree.leaves(physics)
+    # A task may have no parameters.
+    worlds = leaves[0].shape[0] if leaves else 1
     count = keys.shape[0] * worlds
     group = seeds_lib.group_size(count, hidden=settings.architecture.hidden)
     which = jnp.arange(seeds_lib.padded(count, group)) % count

@@ -67,15 +67,17 @@ def save(
         folder: where nothing lies yet.
         functions: by name, which is an identifier of Python.
         card: what a user should know of them, as JSON writes it.
-        readme: the same for people, in Markdown; without it there is none.
+        readme: text of README.md, in Markdown; empty: no such file.
 
     Raises:
         FileExistsError: if something lies at `folder`.
         ModuleNotFoundError: without the extra `export`.
         OSError: if the folder cannot be written.
-        ValueError: if a function uses what numpy's file has no word for, or the card cannot be
+        ValueError: if a function uses an operation that numpy's file lacks, or the card cannot be
             written as JSON.
     """
+    # jax.export needs flatbuffers, and says so only where it writes.
+    import flatbuffers  # noqa: F401
     from safetensors.numpy import save_file
 
     folder = Path(folder)
@@ -93,7 +95,9 @@ def save(
         (partial / CARD).write_text(json.dumps(card, indent=2, allow_nan=False) + "\n")
         if readme:
             (partial / "README.md").write_text(readme)
-        save_file({name: np.asarray(leaf) for name, leaf in params.items()}, partial / PARAMS)
+        # safetensors writes the bytes as they lie in memory.
+        arrays = {name: np.asarray(leaf, order="C") for name, leaf in params.items()}
+        save_file(arrays, partial / PARAMS)
         for name, each in functions.items():
             bound = _bind(each)
             doc = f"{name.capitalize()} of {card.get('task', 'a task')}, as a function of numpy."
@@ -118,11 +122,12 @@ def load(folder: str | Path) -> Exported:
     """Read a folder that `save` wrote.
 
     Raises:
-        FileNotFoundError: if it is none.
+        FileNotFoundError: if nothing was exported there.
         ModuleNotFoundError: without the extra `export`.
         OSError: if a file cannot be read.
         ValueError: if a file is damaged.
     """
+    import flatbuffers  # noqa: F401
     from safetensors.numpy import load_file
 
     folder = Path(folder)
@@ -136,7 +141,7 @@ def load(folder: str | Path) -> Exported:
         }
     except OSError:
         raise
-    # Damaged files raise what safetensors, flatbuffers and JAX like.
+    # Of a damaged file safetensors, flatbuffers and JAX raise errors of many types.
     except Exception as error:
         raise ValueError(
             f"{folder}: a file is damaged ({type(error).__name__}: {error})"
@@ -149,8 +154,10 @@ def _callable(serialised: bytes) -> Callable[..., jax.Array]:
 
     def function(*inputs: Any) -> jax.Array:
         arrays = [jnp.asarray(each, jnp.float32) for each in inputs]
-        leading = arrays[0].shape[:-1]
+        leading, (result,) = arrays[0].shape[:-1], exported.out_avals
+        if 0 in leading:
+            return jnp.zeros((*leading, *result.shape[1:]), result.dtype)
         rows = exported.call(*(each.reshape(-1, each.shape[-1]) for each in arrays))
-        return rows.reshape(*leading, *rows.shape[1:])
+        return rows.reshape(*leading, *result.shape[1:])
 
     return function

@@ -6,6 +6,7 @@ new operation is an entry in `_OPERATIONS`.
 
 import base64
 import io
+import keyword
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -27,11 +28,25 @@ def {name}({inputs}):
 {body}
 
 
+def _rows(value, size, leading):
+    value = np.asarray(value, np.float32)
+    if value.shape[-1:] != (size,) or leading not in (None, value.shape[:-1]):
+        wanted = f"leading axes {{leading}} and then {{size}}"
+        raise ValueError(f"expected {{wanted}}, got {{value.shape}}")
+    return value.reshape(-1, size)
+
+
 _ARRAYS = dict(np.load(io.BytesIO(base64.b64decode("""
 {arrays}
 """)), allow_pickle=False))
 '''
-_INLINED = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "remat")
+_BATCH = "_batch"
+"""The number of rows, in the file."""
+_TAKEN = ("base64", "io", "np")
+_INLINED = (
+    *("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"),
+    *("checkpoint", "remat", "remat2"),
+)
 """Operations that hold a function of their own."""
 
 
@@ -52,19 +67,25 @@ def write(
     Raises:
         ValueError: if the function has an operation that is not written here.
     """
-    (batch,) = export.symbolic_shape("batch")
+    for each in (name, *inputs):
+        if not each.isidentifier() or keyword.iskeyword(each) or each.startswith("_"):
+            raise ValueError(f"{each!r} is no public name of Python")
+        if each in _TAKEN:
+            raise ValueError(f"{each!r} is a name of the file's own")
+    (batch,) = export.symbolic_shape(_BATCH)
     arguments = [jax.ShapeDtypeStruct((batch, size), np.float32) for size in inputs.values()]
     closed = jax.make_jaxpr(function)(*arguments)
     lines = _Lines()
     names = [lines.constant(value) for value in closed.consts]
     # Arguments become float32 rows.
+    first = next(iter(inputs))
+    lines.add(f"_leading = np.shape({first})[:-1]")
     for each, size in inputs.items():
-        lines.add(f"{each} = np.asarray({each}, np.float32)")
-        lines.add(f"leading, {each} = {each}.shape[:-1], {each}.reshape(-1, {size})")
-    lines.add(f"batch = len({next(iter(inputs))})")
+        lines.add(f"{each} = _rows({each}, {size}, {'None' if each == first else '_leading'})")
+    lines.add(f"{_BATCH} = len({first})")
     (result,) = lines.inline(closed.jaxpr, [*names, *inputs])
     (shape,) = (variable.aval.shape[1:] for variable in closed.jaxpr.outvars)
-    lines.add(f"return {result}.reshape({_shape(['*leading', *shape])})")
+    lines.add(f"return np.asarray({result}, np.float32).reshape({_shape(['*_leading', *shape])})")
     return _TEMPLATE.format(
         doc=doc,
         name=name,
@@ -106,18 +127,14 @@ class _Lines:
 
     def inline(self, jaxpr: Any, inputs: Sequence[str]) -> list[str]:
         """Write the operations of a trace; returns the expressions of its results."""
-        known = dict(zip(jaxpr.invars, inputs[-len(jaxpr.invars) :], strict=True))
-        known |= dict(zip(jaxpr.constvars, inputs[: len(jaxpr.constvars)], strict=True))
+        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], inputs, strict=True))
 
         def expression(of: Any) -> str:
             return _literal(of) if isinstance(of, core.Literal) else known[of]
 
         for equation in jaxpr.eqns:
-            arguments = [expression(of) for of in equation.invars]
-            for result, text in zip(
-                equation.outvars, self._operation(equation, arguments), strict=True
-            ):
-                known[result] = text
+            texts = self._operation(equation, [expression(of) for of in equation.invars])
+            known.update(zip(equation.outvars, texts, strict=True))
         return [expression(of) for of in jaxpr.outvars]
 
     def _operation(self, equation: Any, arguments: list[str]) -> list[str]:
@@ -130,9 +147,14 @@ class _Lines:
             return self.inline(inner, arguments)
         if kind not in _OPERATIONS:
             raise ValueError(f"numpy's file has no {kind}, which the function uses")
+        (result,) = equation.outvars
+        text, dtype = _OPERATIONS[kind](equation, *arguments), result.aval.dtype
+        if dtype.kind in "iu":
+            # Numpy counts and sums integers in 64 bits.
+            text = f"np.asarray({text}).astype({_dtype(dtype)})"
         self._count += 1
-        self.add(f"v{self._count} = {_OPERATIONS[kind](equation, *arguments)}")
-        return [f"v{self._count}"]
+        self.add(f"_v{self._count} = {text}")
+        return [f"_v{self._count}"]
 
 
 def _literal(of: Any) -> str:
@@ -143,6 +165,8 @@ def _literal(of: Any) -> str:
 
 
 def _dtype(dtype: Any) -> str:
+    if dtype.kind not in "biuf":
+        raise ValueError(f"numpy's file has no {dtype.name}")
     return f"np.{'bool_' if dtype.kind == 'b' else dtype.name}"
 
 
@@ -181,6 +205,12 @@ def _reshape(equation: Any, x: str) -> str:
 
 def _convert(equation: Any, x: str) -> str:
     return f"np.asarray({x}).astype({_dtype(equation.params['new_dtype'])})"
+
+
+def _divide(equation: Any, left: str, right: str) -> str:
+    if equation.outvars[0].aval.dtype.kind in "iu":
+        raise ValueError("numpy's file has no division of integers")
+    return f"{left} / {right}"
 
 
 def _select(equation: Any, which: str, *cases: str) -> str:
@@ -224,10 +254,17 @@ def _gather(equation: Any, x: str, index: str) -> str:
     """One window, or many rows: then every indexed axis is dropped, the others are taken whole."""
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     shape, indexed = equation.invars[0].aval.shape, numbers.start_index_map
+    if equation.params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP:
+        raise ValueError("numpy's file has no gather that fills what is out of range")
+    # An index out of range is moved into it.
+    places = [
+        f"np.clip({index}[..., {place}], 0, {shape[axis]} - {sizes[axis]})"
+        for place, axis in enumerate(indexed)
+    ]
     if len(equation.invars[1].aval.shape) == 1:
-        windows = ["0:"] * len(shape)
-        for place, axis in enumerate(indexed):
-            windows[axis] = f"{index}[{place}]:{index}[{place}] + {sizes[axis]}"
+        windows = [":"] * len(shape)
+        for place, axis in zip(places, indexed, strict=True):
+            windows[axis] = f"{place} : {place} + {sizes[axis]}"
         return _reshape(equation, f"{x}[{', '.join(windows)}]")
     whole = [axis for axis in range(len(shape)) if axis not in indexed]
     if (
@@ -237,8 +274,7 @@ def _gather(equation: Any, x: str, index: str) -> str:
     ):
         raise ValueError("numpy's file has no such gather")
     count = len(equation.outvars[0].aval.shape) - len(numbers.offset_dims)
-    parts = ", ".join(f"{index}[..., {place}]" for place in range(len(indexed)))
-    rows = f"np.transpose({x}, {(*indexed, *whole)})[{parts}]"
+    rows = f"np.transpose({x}, {(*indexed, *whole)})[{', '.join(places)}]"
     if not numbers.offset_dims:
         return rows
     moved = tuple(range(count, count + len(numbers.offset_dims)))
@@ -258,8 +294,9 @@ _OPERATIONS: dict[str, Write] = {
     "add_any": _infix("+"),
     "sub": _infix("-"),
     "mul": _infix("*"),
-    "div": _infix("/"),
+    "div": _divide,
     "pow": _infix("**"),
+    "rem": _call("np.fmod"),
     "eq": _infix("=="),
     "ne": _infix("!="),
     "lt": _infix("<"),
@@ -288,7 +325,7 @@ _OPERATIONS: dict[str, Write] = {
     "stop_gradient": _call("np.asarray"),
     "is_finite": _call("np.isfinite"),
     "rsqrt": lambda equation, x: f"np.float32(1.0) / np.sqrt({x})",
-    "logistic": lambda equation, x: f"np.float32(1.0) / (np.float32(1.0) + np.exp(-{x}))",
+    "logistic": lambda equation, x: f"np.float32(0.5) * (np.tanh(np.float32(0.5) * {x}) + 1)",
     "integer_pow": lambda equation, x: f"{x} ** {equation.params['y']}",
     "clamp": lambda equation, low, x, high: f"np.clip({x}, {low}, {high})",
     "reduce_sum": _reduce("np.sum"),

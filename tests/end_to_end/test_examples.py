@@ -48,6 +48,6 @@ def test_stable_baselines_trains_on_it(tmp_path):
     pytest.importorskip("stable_baselines3")
     carry(tmp_path / "r_d", envs.make("Pendulum-v1"))
     program = (sys.executable, ROOT / "examples" / "sb3_on_learned_reward.py", tmp_path / "r_d")
-    options = ("--task", "Pendulum-v1", "--seeds", "1", "--steps", "400")
+    options = ("--seeds", "1", "--steps", "400")
     done = subprocess.run([*program, *options], capture_output=True, text=True, check=True)
     assert [line.split(",")[0] for line in done.stdout.splitlines()[1::2]] == ["r_e", "replace"]
