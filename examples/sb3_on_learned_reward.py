@@ -36,7 +36,9 @@ def returns(task, reward, mode, seed, steps):
         env = LearnedReward(env, reward, mode)
     zeros = np.zeros(env.action_space.shape)
     noise = OrnsteinUhlenbeckActionNoise(zeros, zeros + 0.5)
-    agent = DDPG("MlpPolicy", env, seed=seed, action_noise=noise, learning_starts=200)
+    # As wide as this library's networks, and with as large batches.
+    alike = {"policy_kwargs": {"net_arch": [64, 64]}, "batch_size": 32, "learning_starts": 200}
+    agent = DDPG("MlpPolicy", env, seed=seed, action_noise=noise, **alike)
     judge, found = gymnasium.make(task), []
     judge.reset(seed=seed)
     for _ in range(4):

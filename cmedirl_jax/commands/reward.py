@@ -59,9 +59,9 @@ def run(options: Options) -> int:
         chosen = sources.learned(folder, options.method, options.seed, options.n_demos)
         carry.check(options.export, chosen)
     compile_cache.use_cache()
-    devices, plan = start.devices(), None
-    if options.retrain is not None:
-        devices = start.start(ClusterOptions(), None, config["seeds"], {})[1]
+    # Agents are many enough for all cores; the first call of JAX says how many devices it has.
+    agents = config["seeds"] if options.retrain else 1
+    devices, plan = start.start(ClusterOptions(), None, agents, {})[1], None
     # scipy takes a second to import: a refusal does not wait for it.
     from cmedirl_jax.runs.report import retrained, reward_report, reward_samples
 

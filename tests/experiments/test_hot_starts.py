@@ -10,6 +10,7 @@ from experiments.hot_starts import CRITICS, Options
 from tests.support import pools
 
 
+@pytest.mark.slow
 def test_a_row_for_each_loss_with_intervals_over_the_learners(tmp_path, monkeypatch, capsys):
     path, out = tmp_path / "pool.npz", tmp_path / "hot_starts.csv"
     demonstrations.save(path, pools.scripted(3))

@@ -84,6 +84,7 @@ def test_a_large_cluster_may_be_the_one_that_differs():
     assert np.mean([bounded(trial) for trial in range(100)]) >= 0.9
 
 
+@pytest.mark.slow
 def test_shares_on_the_margin_are_called_equivalent_in_at_most_a_twentieth():
     """One pair in fifty differs, all to one side."""
 

@@ -38,7 +38,7 @@ def begin(method, settings=SMALL):
     return trainer, halves, vector, states
 
 
-@pytest.mark.parametrize("method", ["ddpg", "hs-me-ddpg"])
+@pytest.mark.parametrize("method", [pytest.param("ddpg", marks=pytest.mark.slow), "hs-me-ddpg"])
 def test_it_learns_what_run_learns_in_jax(method):
     pool = data() if METHODS[method].uses_demonstrations else None
     in_jax = training.make(IN_JAX, METHODS[method], SMALL, capacity=400)

@@ -25,7 +25,10 @@ def shown():
     return pool._replace(transition=lacking, metadata=metadata)
 
 
-@pytest.mark.parametrize("method", ["me-ddpg", "irl-only", "gail"])
+@pytest.mark.parametrize(
+    "method",
+    ["irl-only", *(pytest.param(name, marks=pytest.mark.slow) for name in ("me-ddpg", "gail"))],
+)
 def test_a_reward_of_states_is_learned_from_states_alone(shown, method):
     fit = jax.jit(
         lambda key: training.fit(

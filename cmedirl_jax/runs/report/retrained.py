@@ -1,7 +1,7 @@
 """Fresh agents on a run's rewards alone, beside agents on r_e and on rewards that know nothing."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -22,9 +22,9 @@ from cmedirl_jax.training.evaluation import Evaluation
 from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.types import Transition
 
-EVALUATIONS = 12
+EVALUATIONS = 8
 """Evaluations of an agent, apart from the first."""
-AT_THE_END = 3
+AT_THE_END = 2
 """Of these, the last ones whose mean is an agent's return."""
 AGENTS, NETWORKS = 2**31, 2**31 + 1
 """What the run's key is folded with for agents and random networks: no seed's number."""
@@ -99,8 +99,8 @@ def _changed(params: Any, change: str) -> Any:
     return dataclasses.replace(params, **numbers) if fields else params._replace(**numbers)
 
 
-def of_run(run: RewardedRun, plan: Plan, say: Callable[[str], None]) -> pl.DataFrame:
-    """A row for each evaluation of each agent: its reward, physics, step, return and goals.
+def of_run(run: RewardedRun, plan: Plan, say: Callable[[str], None]) -> Iterator[pl.DataFrame]:
+    """Train agents on each reward in turn.
 
     Beside the learned rewards stand r_e, a random network that varies as much as they do on average
     over what demonstrations and policies visit, and constants of their size there.
@@ -109,20 +109,23 @@ def of_run(run: RewardedRun, plan: Plan, say: Callable[[str], None]) -> pl.DataF
         run: the rewards.
         plan: what to retrain.
         say: called with a line about each reward before its agents train.
+
+    Yields:
+        A row for each evaluation of each agent of a reward: method, n_demos, seed, physics, step,
+        return and goals.
     """
     every = np.arange(run.context.seeds)
     rewards: list[tuple[str, int, np.ndarray, Rewards | None]] = [
         (name, 0, every, made) for name, made in _controls(run).items()
     ]
     rewards += [(each.method.name, each.n_demos, each.seeds, each.rewards) for each in run.learners]
-    settings, found, programs = run.learners[0].settings, [], {}
+    settings, programs = run.learners[0].settings, {}
     for method, n_demos, seeds, made in rewards:
         say(f"{method}: {len(seeds)} fresh agents, each under {len(plan.physics)} physics")
         pay = None if made is None else made.reward
         train = programs.setdefault(pay, _program(plan, settings, pay))
         labels = (pl.lit(method).alias("method"), pl.lit(n_demos).alias("n_demos"))
-        found.append(_rows(run.context, plan, train, made, seeds).select(*labels, pl.all()))
-    return pl.concat(found)
+        yield _rows(run.context, plan, train, made, seeds).select(*labels, pl.all())
 
 
 def _controls(run: RewardedRun) -> dict[str, Rewards | None]:

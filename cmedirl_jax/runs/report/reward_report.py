@@ -99,7 +99,11 @@ def write(
     # Fresh agents.
     agents = to / "retraining.parquet"
     if plan is not None:
-        _parquet(agents, retrained.of_run(rewarded, plan, say))
+        # Written after each reward: a command that is stopped keeps those that are done.
+        trained: list[pl.DataFrame] = []
+        for table in retrained.of_run(rewarded, plan, say):
+            trained.append(table)
+            _parquet(agents, pl.concat(trained))
     if agents.is_file():
         evaluations = pl.read_parquet(agents)
         measured = retrained.measured(evaluations)
