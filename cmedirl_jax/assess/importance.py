@@ -13,7 +13,8 @@ def permutation(key: jax.Array, rewards: Rewards, steps: Transition) -> jax.Arra
 
     It is the root mean square of how much r_D changes when one input is exchanged among the steps,
     over sqrt(2) of its standard deviation (Breiman 2001, with the reward's own values in place of
-    an error): 1 for a reward of that input alone, 0 for one that does not read it, or is constant.
+    an error): 1 for a reward of that input alone, 0 for one that does not read it, or is constant;
+    above 1 where the exchange leaves what was visited, and r_D varies more there.
 
     Args:
         key: randomness, of the permutations.

@@ -3,15 +3,18 @@
 import numpy as np
 import polars as pl
 import scipy.stats
+from polars.dataframe.group_by import GroupBy
 
 LAST_SHARE = 0.25
 """Share of the evaluations by steps whose mean says how a learner performs at the end."""
+LEAST = 4
+"""Learners that a correlation needs."""
 EVERY = "all"
 """The name of the rows over all methods."""
 DIAGNOSTICS = {
-    "gap": "r_D of demonstrations less that of the learner's background: what is left of Algorithm "
-    "1's gradient",
-    "effective_sample_size": "of the background's weights",
+    "gap": "r_D of demonstrations less that of the learner's background, at the end of its "
+    "learning: what is left of Algorithm 1's objective",
+    "effective_sample_size": "of the background's weights, likewise",
     "discrepancy": "maximum mean discrepancy of demonstrations and policy",
     "wasserstein": "their sliced Wasserstein distance",
     "auc": "how often a demonstrated step is paid more than one of the policy",
@@ -28,65 +31,61 @@ def of_learners(cards: pl.DataFrame, evaluations: pl.DataFrame) -> pl.DataFrame:
         evaluations: the run's table.
     """
     shared = ["method", "n_demos", "seed"]
-    # The last quarter of each learner's own evaluations; the only one of a method without steps.
-    order = pl.col("env_step").rank("dense").over(shared)
-    share = order / pl.col("env_step").n_unique().over(shared)
-    of_training = (
-        evaluations.filter(pl.col("protocol") == "steps")
-        .filter(share > 1.0 - LAST_SHARE)
-        .with_columns(gap=pl.col("demonstration_reward") - pl.col("background_reward"))
-        .group_by(shared, maintain_order=True)
-        .agg(
-            pl.col("gap", "effective_sample_size").mean(),
-            pl.col("return_mean").mean().alias("return"),
-        )
+    by_steps = evaluations.filter(pl.col("protocol") == "steps")
+    # A reward may stop learning long before its agent.
+    learning = _last(by_steps.filter(pl.col("demonstration_reward").is_not_null()), shared)
+    of_reward = learning.agg(
+        (pl.col("demonstration_reward") - pl.col("background_reward")).mean().alias("gap"),
+        pl.col("effective_sample_size").mean(),
     )
-    joined = cards.join(of_training, on=shared, how="left")
+    of_agent = _last(by_steps, shared).agg(pl.col("return_mean").mean().alias("return"))
+    joined = cards.join(of_reward, on=shared, how="left").join(of_agent, on=shared, how="left")
     there = [name for name in DIAGNOSTICS if name in joined.columns]
     return joined.select(*shared, *there, "return")
+
+
+def _last(evaluations: pl.DataFrame, shared: list[str]) -> GroupBy:
+    """The last quarter of each learner's own evaluations, or its only one, by learner."""
+    order = pl.col("env_step").rank("dense").over(shared)
+    share = order / pl.col("env_step").n_unique().over(shared)
+    return evaluations.filter(share > 1.0 - LAST_SHARE).group_by(shared, maintain_order=True)
 
 
 def correlations(learners: pl.DataFrame) -> pl.DataFrame:
     """Spearman's rank correlation of each diagnostic with the return, for each method and for all.
 
     The 95% interval is Bonett and Wright's (2000), which takes learners for independent. Over all
-    methods a correlation is mostly one of differences between methods.
+    methods, learners are ranked among those of their own method and number of demonstrations:
+    otherwise it would be a correlation of methods.
 
     Args:
         learners: as `of_learners` gives them.
     """
-    groups = [(EVERY, None, learners)]
-    groups += [
-        (str(method), n_demos, rows)
-        for (method, n_demos), rows in learners.group_by("method", "n_demos", maintain_order=True)
-    ]
+    pooled: dict[str, list[np.ndarray]] = {}
     found = []
-    for method, n_demos, rows in groups:
-        for name in DIAGNOSTICS:
-            if name not in rows.columns:
-                continue
+    for (method, n_demos), rows in learners.group_by("method", "n_demos", maintain_order=True):
+        for name in (name for name in DIAGNOSTICS if name in rows.columns):
             pairs = rows.select(name, "return").drop_nulls().to_numpy()
-            if len(pairs) < 4 or (np.ptp(pairs, axis=0) == 0).any():
+            if len(pairs) < LEAST or (np.ptp(pairs, axis=0) == 0).any():
                 continue
-            # Spearman's coefficient is Pearson's of the ranks.
-            rho = float(np.corrcoef(scipy.stats.rankdata(pairs, axis=0).T)[0, 1])
-            error = np.sqrt((1.0 + rho**2 / 2.0) / (len(pairs) - 3))
-            # Of a correlation of 1 the interval is one point.
-            with np.errstate(divide="ignore"):
-                low, high = np.tanh(np.arctanh(np.clip(rho, -1.0, 1.0)) + error * _NORMAL)
-            found.append(
-                {
-                    "method": method,
-                    "n_demos": n_demos,
-                    "diagnostic": name,
-                    "learners": len(pairs),
-                    "mean": float(pairs[:, 0].mean()),
-                    "rank_correlation": rho,
-                    "low": float(low),
-                    "high": float(high),
-                }
-            )
+            ranks = scipy.stats.rankdata(pairs, axis=0) / (len(pairs) + 1)
+            pooled.setdefault(name, []).append(ranks)
+            row = {"method": method, "n_demos": n_demos, "diagnostic": name}
+            found.append(row | {"mean": float(pairs[:, 0].mean())} | _correlation(ranks))
+    for name, ranks in pooled.items():
+        found.append({"method": EVERY, "diagnostic": name} | _correlation(np.concatenate(ranks)))
     return pl.DataFrame(found, schema=_CORRELATIONS)
+
+
+def _correlation(ranks: np.ndarray) -> dict[str, float]:
+    """Spearman's coefficient of ranks `[learners, 2]` with its interval."""
+    rho = float(np.corrcoef(ranks.T)[0, 1])
+    error = np.sqrt((1.0 + rho**2 / 2.0) / (len(ranks) - 3))
+    # Of a correlation of 1 the interval is one point.
+    with np.errstate(divide="ignore"):
+        low, high = np.tanh(np.arctanh(np.clip(rho, -1.0, 1.0)) + error * _NORMAL)
+    interval = {"low": float(low), "high": float(high)}
+    return {"learners": len(ranks), "rank_correlation": rho} | interval
 
 
 _CORRELATIONS = {

@@ -48,11 +48,23 @@ def test_a_diagnostic_is_ranked_with_the_return_at_the_end():
     found = reward_diagnostics.correlations(learners)
     # The effective sample size does not vary, and tells nothing.
     assert found.select("method", "diagnostic").rows() == [
-        (method, name) for method in ("all", "me-ddpg") for name in ("gap", "auc")
+        (method, name) for method in ("me-ddpg", "all") for name in ("gap", "auc")
     ]
     assert found["rank_correlation"].to_list() == pytest.approx([-0.7, 1.0] * 2)
     assert (found["low"] <= found["rank_correlation"]).all()
     assert (found["rank_correlation"] <= found["high"]).all()
+
+
+def test_over_all_methods_learners_are_ranked_among_their_own():
+    rows = [
+        {"method": method, "n_demos": 5, "auc": base + i / 10, "return": base * 90 + sign * i}
+        for method, base, sign in (("gail", 0.0, 1), ("me-ddpg", 1.0, -1))
+        for i in range(6)
+    ]
+    found = reward_diagnostics.correlations(pl.DataFrame(rows))
+    correlation = dict(found.select("method", "rank_correlation").rows())
+    # Pooled as they are they would correlate by 0.5.
+    assert correlation == pytest.approx({"gail": 1.0, "me-ddpg": -1.0, "all": 0.0})
 
 
 def test_the_interval_covers_the_correlation_of_normal_pairs():
