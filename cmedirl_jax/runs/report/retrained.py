@@ -102,8 +102,9 @@ def _changed(params: Any, change: str) -> Any:
 def of_run(run: RewardedRun, plan: Plan, say: Callable[[str], None]) -> Iterator[pl.DataFrame]:
     """Train agents on each reward in turn.
 
-    Beside the learned rewards stand r_e, a random network that varies as much as they do on average
-    over what demonstrations and policies visit, and constants of their size there.
+    Beside the learned rewards stand r_e, a random network that varies as much as they do over what
+    demonstrations and policies visit, and constants of their size there (medians over methods).
+    Rewards are paid as they were learned, whatever their scale.
 
     Args:
         run: the rewards.
@@ -131,8 +132,9 @@ def of_run(run: RewardedRun, plan: Plan, say: Callable[[str], None]) -> Iterator
 def _controls(run: RewardedRun) -> dict[str, Rewards | None]:
     """The rewards that the learned ones are compared with; None is r_e."""
     values = [_values(each.rewards, each.visited) for each in run.learners]
-    size = np.mean([np.sqrt(np.square(each).mean(axis=1)).mean() for each in values])
-    deviation = np.mean([each.std(axis=1).mean() for each in values])
+    # Medians over the methods: the rewards of one may be thousands of times as large.
+    size = np.median([np.sqrt(np.square(each).mean(axis=1)).mean() for each in values])
+    deviation = np.median([each.std(axis=1).mean() for each in values])
 
     learner = controls.random(run.context.env.spec)
     key = jax.random.fold_in(run.context.key, NETWORKS)
