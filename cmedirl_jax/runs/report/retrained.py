@@ -253,6 +253,8 @@ def figure(rows: pl.DataFrame, seeds: pl.DataFrame, threshold: float | None) -> 
     rows = rows.filter(pl.col("n_demos").is_in([0, rows["n_demos"].max()]))
     physics = rows["physics"].unique(maintain_order=True).to_list()
     lines = curves.lines(rows["method"].unique(maintain_order=True))
+    # What the others are compared with stands out.
+    lines[TRUE] = {"color": "black", "linestyle": "-"}
     drawn = Figure(figsize=(4.2 * len(physics), 3.6), layout="constrained")
     panels = drawn.subplots(1, len(physics), sharey=True, squeeze=False)[0]
     for axes, world in zip(panels, physics, strict=True):
@@ -260,7 +262,9 @@ def figure(rows: pl.DataFrame, seeds: pl.DataFrame, threshold: float | None) -> 
         of_world = rows.filter(pl.col("physics") == world)
         for method, line in lines.items():
             of_method = of_world.filter(pl.col("method") == method)
-            curves.band(axes, of_method, "env_step", "return_mean", method, line)
+            # A method's own label says how r_D joins r_e there: here it stands alone.
+            name = "$r_e$" if method == TRUE else f"$r_D$: {method}"
+            curves.band(axes, of_method, "env_step", "return_mean", name, line)
         axes.set_title(f"{world} physics" if world == OWN else world, fontsize=10)
         axes.set_xlabel("environment steps")
     panels[0].set_ylabel("return of $r_e$")

@@ -82,6 +82,10 @@ def figure(run: RewardedRun, importances: pl.DataFrame) -> Callable[[], Figure]:
                 axes.fill_between(one.at, low, high, color=curves.COLOURS[0], alpha=0.2, lw=0)
                 axes.plot(one.at, one.reward.mean(axis=0), color=curves.COLOURS[0])
                 axes.tick_params(labelsize=7)
+                axes.ticklabel_format(axis="y", useOffset=False)
+            if not any(np.ptp(one.reward) for one in of_method):
+                # The axis of a constant would show its rounding.
+                row[0].set_ylim(of_method[0].reward.flat[0] + np.array([-1.0, 1.0]))
             row[0].set_ylabel(learners.name, fontsize=8)
         for axes, column in zip(panels[-1], chosen, strict=True):
             axes.set_xlabel(names[column], fontsize=8)
