@@ -199,6 +199,15 @@ def finished_in_part(runs, run):
     assert rows == [(1, seed) for seed in range(3)]
 
 
+def test_a_run_that_was_killed_and_stopped_is_as_one_that_nothing_befell(runs, whole, tmp_path):
+    run = tmp_path / "run"
+    killed_between(runs, run, 1, 250)
+    terminated_at(runs, run, STEPS + 500)
+    assert "hs-me-ddpg-n2-seeds-0-3 goes on from its checkpoint" in runs.finish(run)
+    assert_same_run(run, whole)
+
+
+@pytest.mark.slow
 def test_a_run_that_all_of_this_befell_is_as_one_that_nothing_befell(runs, whole, tmp_path):
     run = tmp_path / "run"
     killed_between(runs, run, 1, 250)

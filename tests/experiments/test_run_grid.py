@@ -282,6 +282,7 @@ def test_a_demonstrations_file_that_cannot_be_used_is_refused(refused, demos, da
     assert refused("--demos", demos, "--n-demos", 1).startswith(f"--demos: {demos}: ")
 
 
+@pytest.mark.slow
 def test_demonstrations_of_any_format_are_those_of_our_own(main, demos, tmp_path):
     table = tmp_path / "pool.csv"
     tables_of_steps.write_table(table, pools.scripted(3))
@@ -729,6 +730,7 @@ def test_methods_with_a_model_run_beside_the_others(unoptimised, demos, tmp_path
     }
 
 
+@pytest.mark.slow
 def test_comparators_and_controls_run_beside_the_others(unoptimised, demos, tmp_path):
     methods = ("bc", "gail", "ddpg-minus-constant", "random-reward")
     folder = tmp_path / "run"
