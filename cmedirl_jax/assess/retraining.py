@@ -8,16 +8,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import checks
 from cmedirl_jax.assess.card import Rewards
 from cmedirl_jax.envs import Env
 from cmedirl_jax.envs.with_reward import PayingParams, with_reward
-from cmedirl_jax.training import evaluation, trainer
 from cmedirl_jax.training import seeds as seeds_lib
+from cmedirl_jax.training import trainer
 from cmedirl_jax.training.evaluation import Evaluation
-from cmedirl_jax.training.fit import learn_and_evaluate
-from cmedirl_jax.training.initialise import TrainingState
-from cmedirl_jax.training.methods import METHODS
+from cmedirl_jax.training.fit import learn_and_evaluate, prepare
 from cmedirl_jax.training.settings import Settings
 
 
@@ -69,10 +66,9 @@ def retrain(
         ValueError: for sizes that are not positive, or `steps` that are no multiple of
             `evaluate_every`.
     """
-    checks.sizes(steps=steps, evaluate_every=evaluate_every, evaluation_starts=evaluation_starts)
-    if steps % evaluate_every:
-        raise ValueError(f"steps ({steps}) must be a multiple of evaluate_every ({evaluate_every})")
-    settings = settings or Settings()
+    budget = {"steps": steps, "evaluate_every": evaluate_every}
+    budget["evaluation_starts"] = evaluation_starts
+    task = prepare(env.spec, "ddpg", None, None, settings, seeds=keys.shape[0], **budget)
     if physics is None:
         physics = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], env.default_params)
     paying = env if rewards is None else with_reward(env, rewards.reward)
@@ -81,25 +77,16 @@ def retrain(
         params = learner.physics
         if rewards is not None:
             params = PayingParams(params, learner.reward)
-        made = trainer.make(paying, METHODS["ddpg"], settings, capacity=steps, env_params=params)
-
-        def evaluate(state: TrainingState) -> Evaluation:
-            return evaluation.evaluate(
-                lambda observation: made.act(state.agent.actor, observation),
-                env,
-                learner.physics,
-                evaluation_starts,
-            )
-
+        made = trainer.make(paying, task.method, task.settings, capacity=steps, env_params=params)
         state = made.init(learner.key, None, 0)
-        return learn_and_evaluate(made, state, None, evaluate, steps, evaluate_every).evaluations
+        return learn_and_evaluate(made, state, None, env, learner.physics, **budget).evaluations
 
     # Every reward under every physics, in groups that fit the cache.
     leaves = jax.tree.leaves(physics)
     # A task may have no parameters.
     worlds = leaves[0].shape[0] if leaves else 1
     count = keys.shape[0] * worlds
-    group = seeds_lib.group_size(count, hidden=settings.architecture.hidden)
+    group = seeds_lib.group_size(count, hidden=task.settings.architecture.hidden)
     which = jnp.arange(seeds_lib.padded(count, group)) % count
     agent, world = which // worlds, which % worlds
     learners = _Learner(

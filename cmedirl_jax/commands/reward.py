@@ -52,7 +52,8 @@ class Options(sources.PolicyOptions):
 
 def run(options: Options) -> int:
     """Run the command; returns its exit code."""
-    folder, config = options.folder, run_folder.read(options.folder)["config"]
+    folder, written = options.folder, run_folder.read(options.folder)
+    config = written["config"]
     _check_together(options)
     chosen = None
     if options.export is not None:
@@ -71,7 +72,7 @@ def run(options: Options) -> int:
             sources.task(config["env"]), options.retrain, options.physics, devices
         )
     with run_folder.held(folder):
-        solved = run_folder.solved(folder, run_folder.read(folder))
+        solved = run_folder.solved(folder, written)
         run = Run(folder, config, solved, tables.read(folder, config))
         rewarded = reward_samples.read(folder)
         if rewarded.diverged:

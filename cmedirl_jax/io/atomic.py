@@ -21,13 +21,19 @@ def replacing(path: Path) -> Iterator[Path]:
     An error leaves nothing.
     """
     written = partial(path)
+    # A process that was killed may have left something there.
+    _remove(written)
     try:
         yield written
         replace(written, path)
     finally:
-        if written.is_dir():
-            shutil.rmtree(written)
-        written.unlink(missing_ok=True)
+        _remove(written)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
 
 
 def replace(written: Path, path: Path) -> None:

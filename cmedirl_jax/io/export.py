@@ -10,7 +10,6 @@ serialises, and as a file of Python that needs numpy alone. Needs the extra `exp
 """
 
 import json
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -89,8 +88,6 @@ def save(
         for place, leaf in jax.tree.leaves_with_path(each.params)
     }
     with atomic.replacing(folder) as partial:
-        # A save that was killed may have left something.
-        shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir(parents=True)
         (partial / CARD).write_text(json.dumps(card, indent=2, allow_nan=False) + "\n")
         if readme:

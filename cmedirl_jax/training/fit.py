@@ -1,7 +1,6 @@
 """Training many seeds and evaluating them as they go, in one call."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -134,17 +133,18 @@ def fit(
     )
     trainer = make(env, task.method, task.settings, capacity=steps)
 
-    def evaluate(state: TrainingState) -> Evaluation:
-        return evaluation.evaluate(
-            lambda observation: trainer.act(state.agent.actor, observation),
-            env,
-            env.default_params,
-            evaluation_starts,
-        )
-
     def learn(key: jax.Array) -> Result:
         state = trainer.init(key, task.data, task.n_demonstrations)
-        return learn_and_evaluate(trainer, state, task.data, evaluate, steps, evaluate_every)
+        return learn_and_evaluate(
+            trainer,
+            state,
+            task.data,
+            env,
+            env.default_params,
+            steps=steps,
+            evaluate_every=evaluate_every,
+            evaluation_starts=evaluation_starts,
+        )
 
     group = seeds_lib.group_size(seeds, hidden=task.settings.architecture.hidden)
     keys = seeds_lib.keys(key, seeds_lib.padded(seeds, group))
@@ -156,20 +156,33 @@ def learn_and_evaluate(
     trainer: Trainer,
     state: TrainingState,
     data: HotStartData | None,
-    evaluate: Callable[[TrainingState], Evaluation],
+    env: Env,
+    params: Any,
+    *,
     steps: int,
     evaluate_every: int,
+    evaluation_starts: int,
 ) -> Result:
     """Train one seed from its first state, and evaluate it as it goes: leaves without seeds.
 
     Args:
-        trainer: the method on the environment.
+        trainer: the method on its environment.
         state: what its `init` gave.
         data: the demonstrations; None for a method without.
-        evaluate: what is said of a state.
+        env: the environment to evaluate in.
+        params: its parameters.
         steps: environment steps; a multiple of `evaluate_every`.
         evaluate_every: steps between evaluations.
+        evaluation_starts: start states per evaluation.
     """
+
+    def evaluate(state: TrainingState) -> Evaluation:
+        return evaluation.evaluate(
+            lambda observation: trainer.act(state.agent.actor, observation),
+            env,
+            params,
+            evaluation_starts,
+        )
 
     def chunk(state: TrainingState, steps: jax.Array):
         state, log = trainer.run(state, data, steps)

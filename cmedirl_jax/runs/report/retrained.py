@@ -16,7 +16,7 @@ from cmedirl_jax.irl import controls
 from cmedirl_jax.runs.drawing import Figure
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.report import curves
-from cmedirl_jax.runs.report.reward_samples import Context, RewardedRun
+from cmedirl_jax.runs.report.reward_samples import LEARNER, Context, RewardedRun, with_experts
 from cmedirl_jax.training import seeds as seeds_lib
 from cmedirl_jax.training.evaluation import Evaluation
 from cmedirl_jax.training.settings import Settings
@@ -227,7 +227,7 @@ def measured(rows: pl.DataFrame) -> pl.DataFrame:
     last = pl.col("env_step").rank("dense", descending=True).over("method") <= AT_THE_END
     agents = (
         rows.filter(last)
-        .group_by("method", "n_demos", "seed", "physics", maintain_order=True)
+        .group_by(*LEARNER, "physics", maintain_order=True)
         .agg(
             pl.col("return_mean").mean().alias("return"),
             pl.col("goal_fraction").mean().alias("goal"),
@@ -248,8 +248,7 @@ def figure(rows: pl.DataFrame, seeds: pl.DataFrame, threshold: float | None) -> 
         seeds: the run's table, whose `expert_id` says which seeds share an expert.
         threshold: return that counts as solved.
     """
-    shared = ["method", "n_demos", "seed"]
-    rows = rows.join(seeds.select(*shared, "expert_id"), on=shared, how="left")
+    rows = with_experts(rows, seeds)
     rows = rows.filter(pl.col("n_demos").is_in([0, rows["n_demos"].max()]))
     physics = rows["physics"].unique(maintain_order=True).to_list()
     lines = curves.lines(rows["method"].unique(maintain_order=True))

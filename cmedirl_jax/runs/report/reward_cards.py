@@ -14,7 +14,7 @@ from cmedirl_jax.assess.card import Rewards
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.runs import intervals
-from cmedirl_jax.runs.report.reward_samples import Context, Learners, RewardedRun
+from cmedirl_jax.runs.report.reward_samples import Context, Learners, RewardedRun, with_experts
 from cmedirl_jax.tabular import discretise
 
 COMPARED, DRAWS = 4_096, 64
@@ -134,8 +134,7 @@ def summarise(
         seeds: the run's table, whose `expert_id` says which seeds share an expert.
         measures: the columns to summarise.
     """
-    shared = ["method", "n_demos", "seed"]
-    rows = rows.join(seeds.select(*shared, "expert_id"), on=shared, how="left")
+    rows = with_experts(rows, seeds)
     labels = [name for name in ("method", "n_demos", "physics") if name in rows.columns]
     found = []
     for values, cell in rows.group_by(labels, maintain_order=True):

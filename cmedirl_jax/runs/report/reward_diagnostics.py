@@ -5,6 +5,8 @@ import polars as pl
 import scipy.stats
 from polars.dataframe.group_by import GroupBy
 
+from cmedirl_jax.runs.report.reward_samples import LEARNER
+
 LAST_SHARE = 0.25
 """Share of the evaluations by steps whose mean says how a learner performs at the end."""
 LEAST = 4
@@ -30,25 +32,24 @@ def of_learners(cards: pl.DataFrame, evaluations: pl.DataFrame) -> pl.DataFrame:
         cards: a row for each reward, with the diagnostics that are not of the training.
         evaluations: the run's table.
     """
-    shared = ["method", "n_demos", "seed"]
     by_steps = evaluations.filter(pl.col("protocol") == "steps")
     # A reward may stop learning long before its agent.
-    learning = _last(by_steps.filter(pl.col("demonstration_reward").is_not_null()), shared)
+    learning = _last(by_steps.filter(pl.col("demonstration_reward").is_not_null()))
     of_reward = learning.agg(
         (pl.col("demonstration_reward") - pl.col("background_reward")).mean().alias("gap"),
         pl.col("effective_sample_size").mean(),
     )
-    of_agent = _last(by_steps, shared).agg(pl.col("return_mean").mean().alias("return"))
-    joined = cards.join(of_reward, on=shared, how="left").join(of_agent, on=shared, how="left")
+    of_agent = _last(by_steps).agg(pl.col("return_mean").mean().alias("return"))
+    joined = cards.join(of_reward, on=LEARNER, how="left").join(of_agent, on=LEARNER, how="left")
     there = [name for name in DIAGNOSTICS if name in joined.columns]
-    return joined.select(*shared, *there, "return")
+    return joined.select(*LEARNER, *there, "return")
 
 
-def _last(evaluations: pl.DataFrame, shared: list[str]) -> GroupBy:
+def _last(evaluations: pl.DataFrame) -> GroupBy:
     """The last quarter of each learner's own evaluations, or its only one, by learner."""
-    order = pl.col("env_step").rank("dense").over(shared)
-    share = order / pl.col("env_step").n_unique().over(shared)
-    return evaluations.filter(share > 1.0 - LAST_SHARE).group_by(shared, maintain_order=True)
+    order = pl.col("env_step").rank("dense").over(LEARNER)
+    share = order / pl.col("env_step").n_unique().over(LEARNER)
+    return evaluations.filter(share > 1.0 - LAST_SHARE).group_by(LEARNER, maintain_order=True)
 
 
 def correlations(learners: pl.DataFrame) -> pl.DataFrame:

@@ -1,7 +1,6 @@
 """The report on a run's rewards: tables, pictures and a page in RUN/reward."""
 
 import functools
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +19,7 @@ from cmedirl_jax.runs.report import (
     reward_slices,
 )
 from cmedirl_jax.runs.report.base import Run
-from cmedirl_jax.runs.report.reward_samples import RewardedRun
+from cmedirl_jax.runs.report.reward_samples import LEARNER, RewardedRun
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.runs.storage import outputs
 
@@ -76,12 +75,11 @@ def write(
 
     # Each reward beside the task's, beside demonstrations, and beside those of other seeds.
     agreement = reward_agreement.of_run(rewarded)
-    shared = ["method", "n_demos", "seed"]
-    rows = reward_cards.of_run(rewarded).join(reward_agreement.rows(agreement), on=shared)
+    rows = reward_cards.of_run(rewarded).join(reward_agreement.rows(agreement), on=LEARNER)
     importances = reward_slices.importances(rewarded)
     learners = reward_diagnostics.of_learners(rows, run.tables["evaluations"])
-    _parquet(to / "seeds.parquet", rows)
-    _parquet(to / "diagnostics.parquet", learners)
+    outputs.write_table(to / "seeds.parquet", rows)
+    outputs.write_table(to / "diagnostics.parquet", learners)
     report = RewardReport(
         rows,
         _csv(to / "summary.csv", reward_cards.summarise(rows, seeds)),
@@ -103,7 +101,7 @@ def write(
         trained: list[pl.DataFrame] = []
         for table in retrained.of_run(rewarded, plan, say):
             trained.append(table)
-            _parquet(agents, pl.concat(trained))
+            outputs.write_table(agents, pl.concat(trained))
     if agents.is_file():
         evaluations = pl.read_parquet(agents)
         measured = retrained.measured(evaluations)
@@ -127,18 +125,11 @@ def write(
 
 def _outdated(rows: pl.DataFrame, evaluations: pl.DataFrame) -> str | None:
     """How the rewards that were retrained differ from those of the run."""
-    shared = ["method", "n_demos", "seed"]
-    missing = rows.join(evaluations, on=shared, how="anti")
+    missing = rows.join(evaluations, on=LEARNER, how="anti")
     if missing.is_empty():
         return None
     methods = ", ".join(missing["method"].unique(maintain_order=True))
     return f"Rewards that came later have no fresh agents: {methods}; give --retrain again."
-
-
-def _parquet(path: Path, table: pl.DataFrame) -> None:
-    buffer = io.BytesIO()
-    table.write_parquet(buffer)
-    outputs.write(path, buffer.getvalue())
 
 
 def _csv(path: Path, table: pl.DataFrame) -> pl.DataFrame:

@@ -23,6 +23,8 @@ from cmedirl_jax.training.methods import Method
 from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.types import DemonstrationSubset, Transition
 
+LEARNER = ("method", "n_demos", "seed")
+"""The columns that say whose a row is."""
 SAMPLED = 2_048
 """Steps of demonstrations, and of each policy."""
 EPISODES = 4
@@ -86,6 +88,16 @@ class Learners(NamedTuple):
         )
 
 
+def with_experts(rows: pl.DataFrame, seeds: pl.DataFrame) -> pl.DataFrame:
+    """Rows of learners with their `expert_id`, null where there is none.
+
+    Args:
+        rows: with the columns `LEARNER`.
+        seeds: the run's table.
+    """
+    return rows.join(seeds.select(*LEARNER, "expert_id"), on=LEARNER, how="left")
+
+
 class RewardedRun(NamedTuple):
     """A run's rewards.
 
@@ -137,7 +149,9 @@ def _of_cell(context: Context, learned: LearnedCell) -> Learners:
     """The learners of one block of seeds whose rewards are finite."""
     rng, pool, key = np.random.default_rng(0), context.pool, learned.cell.key
     pay, params = learned.rewards()
-    finite = [np.isfinite(leaf).reshape(key.seeds, -1).all(axis=1) for leaf in _leaves(params)]
+    finite = [
+        np.isfinite(leaf).reshape(key.seeds, -1).all(axis=1) for leaf in jax.tree.leaves(params)
+    ]
     which = np.flatnonzero(np.logical_and.reduce(finite))
     seeds = key.first_seed + which
     # Steps of demonstrations, and of the policies.
@@ -161,10 +175,6 @@ def _of_cell(context: Context, learned: LearnedCell) -> Learners:
         played=_drawn(rng, played),
         held_out=held_out,
     )
-
-
-def _leaves(params: Any) -> list[np.ndarray]:
-    return [np.asarray(leaf) for leaf in jax.tree.leaves(params)]
 
 
 def _rows(params: Any, which: np.ndarray) -> Any:

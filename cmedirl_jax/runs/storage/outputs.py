@@ -1,8 +1,11 @@
 """Files that a command writes when its work is done."""
 
 import errno
+import io
 import os
 from pathlib import Path
+
+import polars as pl
 
 from cmedirl_jax.io import atomic
 from cmedirl_jax.runs.errors import UserError
@@ -35,3 +38,14 @@ def write(path: Path, content: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic.replacing(path) as partial:
         partial.write_bytes(content)
+
+
+def write_table(path: Path, table: pl.DataFrame) -> None:
+    """Write a table as Parquet, as `write` does.
+
+    Raises:
+        OSError: if it cannot be written; then nothing is.
+    """
+    buffer = io.BytesIO()
+    table.write_parquet(buffer)
+    write(path, buffer.getvalue())

@@ -1,6 +1,5 @@
 """The run's tables: a cell's result as rows, and the rows of the cells that were asked for."""
 
-import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -188,6 +187,4 @@ def read(folder: Path, config: dict[str, Any]) -> dict[str, pl.DataFrame]:
 def write(folder: Path, tables: dict[str, pl.DataFrame]) -> None:
     """Write the run's tables; those that are there already stay untouched."""
     for name, table in tables.items():
-        buffer = io.BytesIO()
-        table.write_parquet(buffer)
-        outputs.write(folder / f"{name}.parquet", buffer.getvalue())
+        outputs.write_table(folder / f"{name}.parquet", table)
