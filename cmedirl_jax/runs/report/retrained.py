@@ -99,12 +99,30 @@ def _changed(params: Any, change: str) -> Any:
     return dataclasses.replace(params, **numbers) if fields else params._replace(**numbers)
 
 
-def of_run(run: RewardedRun, plan: Plan, say: Callable[[str], None]) -> Iterator[pl.DataFrame]:
-    """Train agents on each reward in turn.
+class _Frozen(NamedTuple):
+    """Rewards that agents learn from.
 
-    Beside the learned rewards stand r_e, a random network that varies as much as they do over what
-    demonstrations and policies visit, and constants of their size there (medians over methods).
-    Rewards are paid as they were learned, whatever their scale.
+    Attributes:
+        method: their name.
+        n_demos: demonstrations that each was learned from.
+        seeds: `[R]`, of the agents.
+        rewards: `R` of them.
+        size: `[R]`, root mean square of what each pays for the steps that were visited.
+    """
+
+    method: str
+    n_demos: int
+    seeds: np.ndarray
+    rewards: Rewards
+    size: np.ndarray
+
+
+def of_run(run: RewardedRun, plan: Plan, say: Callable[[str], None]) -> Iterator[pl.DataFrame]:
+    """Train agents on r_e, on random networks and constants, and on each learned reward in turn.
+
+    All but r_e are scaled to one root mean square over the steps that demonstrations and policies
+    visit, the median over methods of what was learned: an agent depends on a reward's scale, and an
+    optimum does not.
 
     Args:
         run: the rewards.
@@ -115,72 +133,78 @@ def of_run(run: RewardedRun, plan: Plan, say: Callable[[str], None]) -> Iterator
         A row for each evaluation of each agent of a reward: method, n_demos, seed, physics, step,
         return and goals.
     """
-    every = np.arange(run.context.seeds)
-    rewards: list[tuple[str, int, np.ndarray, Rewards | None]] = [
-        (name, 0, every, made) for name, made in _controls(run).items()
+    learned = [
+        _Frozen(
+            each.method.name,
+            each.n_demos,
+            each.seeds,
+            each.rewards,
+            _size(each.rewards, each.visited),
+        )
+        for each in run.learners
     ]
-    rewards += [(each.method.name, each.n_demos, each.seeds, each.rewards) for each in run.learners]
+    size = float(np.median([each.size.mean() for each in learned]))
     settings, programs = run.learners[0].settings, {}
-    for method, n_demos, seeds, made in rewards:
+
+    def train(method: str, n_demos: int, seeds: np.ndarray, pay: Any, params: Any) -> pl.DataFrame:
         say(f"{method}: {len(seeds)} fresh agents, each under {len(plan.physics)} physics")
-        pay = None if made is None else made.reward
-        train = programs.setdefault(pay, _program(plan, settings, pay))
+        program = programs.setdefault(pay, _program(plan, settings, pay))
         labels = (pl.lit(method).alias("method"), pl.lit(n_demos).alias("n_demos"))
-        yield _rows(run.context, plan, train, made, seeds).select(*labels, pl.all())
+        return _rows(run.context, plan, program, params, seeds).select(*labels, pl.all())
+
+    yield train(TRUE, 0, np.arange(run.context.seeds), None, ())
+    for method, n_demos, seeds, rewards, own in [*_controls(run), *learned]:
+        # What pays nothing anywhere stays as it is.
+        scales = np.divide(size, own, out=np.ones_like(own), where=own > 0).astype(np.float32)
+        yield train(method, n_demos, seeds, rewards.reward, (scales, rewards.params))
 
 
-def _controls(run: RewardedRun) -> dict[str, Rewards | None]:
-    """The rewards that the learned ones are compared with; None is r_e."""
-    values = [_values(each.rewards, each.visited) for each in run.learners]
-    # Medians over the methods: the rewards of one may be thousands of times as large.
-    size = np.median([np.sqrt(np.square(each).mean(axis=1)).mean() for each in values])
-    deviation = np.median([each.std(axis=1).mean() for each in values])
-
+def _controls(run: RewardedRun) -> list[_Frozen]:
+    """The rewards that the learned ones are compared with, apart from r_e."""
+    count = run.context.seeds
+    every, ones = np.arange(count), np.ones(count)
     learner = controls.random(run.context.env.spec)
     key = jax.random.fold_in(run.context.key, NETWORKS)
-    states = jax.vmap(learner.init)(seeds_lib.keys(key, run.context.seeds))
-
-    def random(params: Any, observation: jax.Array, action: jax.Array) -> jax.Array:
-        scale, state = params
-        return scale * learner.reward(state, observation, action)
-
-    def scaled(scale: float, seeds: np.ndarray) -> Rewards:
-        own = jax.tree.map(lambda leaf: leaf[seeds], states)
-        return Rewards(random, (jnp.full(len(seeds), scale, jnp.float32), own))
+    networks = Rewards(learner.reward, jax.vmap(learner.init)(seeds_lib.keys(key, count)))
+    # A learner may be left out, so that there are fewer of them than seeds.
+    first = run.learners[0]
+    steps = jax.tree.map(lambda leaf: leaf[every % len(first.seeds)], first.visited)
 
     def constant(params: jax.Array, observation: jax.Array, action: jax.Array) -> jax.Array:
         del action
         return jnp.broadcast_to(params, observation.shape[:-1])
 
-    first, every = run.learners[0], np.arange(run.context.seeds)
-    unscaled = _values(scaled(1.0, first.seeds), first.visited).std(axis=1).mean()
-    sizes = jnp.full(len(every), size, jnp.float32)
-    return {
-        TRUE: None,
-        "random": scaled(float(deviation / unscaled), every),
-        "+constant": Rewards(constant, sizes),
-        "-constant": Rewards(constant, -sizes),
-    }
+    return [
+        _Frozen("random", 0, every, networks, _size(networks, steps)),
+        _Frozen("+constant", 0, every, Rewards(constant, np.float32(ones)), ones),
+        _Frozen("-constant", 0, every, Rewards(constant, np.float32(-ones)), ones),
+    ]
 
 
-def _values(rewards: Rewards, steps: Transition) -> np.ndarray:
-    """`[R, N]`, what each reward pays for steps `[R, N, ...]`."""
-    paid = jax.jit(jax.vmap(rewards.reward))(rewards.params, steps.observation, steps.action)
-    return np.asarray(paid, np.float64)
+def _size(rewards: Rewards, steps: Transition) -> np.ndarray:
+    """`[R]`, root mean square of what each reward pays for its steps, leaves `[R, N, ...]`."""
+    pay = jax.jit(jax.vmap(rewards.reward))
+    paid = np.asarray(pay(rewards.params, steps.observation, steps.action), np.float64)
+    return np.sqrt(np.square(paid).mean(axis=1))
 
 
 def _program(
     plan: Plan, settings: Settings, pay: Callable[..., jax.Array] | None
 ) -> Callable[..., Evaluation]:
-    """Trains agents on rewards of one function: `((keys, params) [R, ...]) -> Evaluation`."""
+    """Trains agents on rewards of one function: `(keys, (scale, params)), [R, ...] -> Evaluation`."""
     physics = jax.tree.map(lambda *leaves: np.stack(leaves), *plan.physics.values())
+
+    def scaled(params: Any, observation: jax.Array, action: jax.Array) -> jax.Array:
+        assert pay is not None
+        scale, own = params
+        return scale * pay(own, observation, action)
 
     def train(agents: tuple[jax.Array, Any]) -> Evaluation:
         keys, params = agents
         return retraining.retrain(
             keys,
             plan.env,
-            None if pay is None else Rewards(pay, params),
+            None if pay is None else Rewards(scaled, params),
             physics,
             steps=plan.steps,
             settings=settings,
@@ -194,7 +218,7 @@ def _rows(
     context: Context,
     plan: Plan,
     train: Callable[..., Evaluation],
-    rewards: Rewards | None,
+    params: Any,
     seeds: np.ndarray,
 ) -> pl.DataFrame:
     """The evaluations of the agents of one reward of each seed."""
@@ -202,7 +226,6 @@ def _rows(
     count = seeds_lib.padded(len(seeds), 1, len(plan.devices))
     order = np.arange(count) % len(seeds)
     keys = seeds_lib.keys(jax.random.fold_in(context.key, AGENTS), context.seeds)[seeds]
-    params = () if rewards is None else rewards.params
     agents = jax.tree.map(lambda leaf: jnp.asarray(leaf)[order], (keys, params))
     found = jax.tree.map(lambda leaf: leaf[: len(seeds)], jax.device_get(train(agents)))
     shape = found.return_mean.shape
