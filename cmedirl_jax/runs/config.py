@@ -74,6 +74,8 @@ class RunConfig:
         n_demos: Demonstrated trajectories N_T per learner; by default also all that --demos holds,
             where it holds fewer.
         seeds: Independent learners per cell.
+        seeds_at_once: Of these, how many train together; the next ones follow, so that memory is
+            theirs. Default: all.
         seed: Seed of the whole run.
         max_steps: Environment steps per learner.
         max_episodes: Episodes per learner; with max-steps, whichever comes first.
@@ -101,6 +103,7 @@ class RunConfig:
     methods: Annotated[tuple[str, ...], tyro.conf.arg(aliases=("--method",))] = PAPER_METHODS
     n_demos: tuple[Size, ...] = (200,)
     seeds: Size = 100
+    seeds_at_once: Size | None = None
     seed: Annotated[int, Range(0, 2**32 - 1, "between 0 and 2^32 - 1")] = 0
     max_steps: Size | None = 12_000
     max_episodes: Size | None = None

@@ -102,7 +102,9 @@ def _missing(plan: Plan, finished: Sequence[cells.SavedCell]) -> list[tuple[str,
         (method, n_demos, block.start, block.stop)
         # Cells of equal N_T follow each other: their methods share a hot start.
         for method, n_demos in sorted(plan.asked, key=lambda cell: cell[1])
-        for block in cells.missing_blocks(plan.folder, keys, method, n_demos, plan.seeds)
+        for block in cells.missing_blocks(
+            plan.folder, keys, method, n_demos, plan.seeds, plan.seeds_at_once
+        )
     ]
 
 

@@ -38,6 +38,7 @@ class Plan(NamedTuple):
         study: the study's seed.
         asked: method and number of demonstrations of each cell.
         seeds: how many learners of each.
+        seeds_at_once: of these, how many train together; None: all.
         budget: how long they train, and when they are evaluated.
         settings: every other choice of theirs.
         subset_size: the largest number of demonstrations of a learner.
@@ -55,6 +56,7 @@ class Plan(NamedTuple):
     study: int
     asked: list[tuple[str, int]]
     seeds: int
+    seeds_at_once: int | None
     budget: Budget
     settings: Settings
     subset_size: int
@@ -120,6 +122,7 @@ def plan(config: StudyConfig, cluster: Cluster = ALONE, *, fewer_will_do: bool =
         study=config.seed,
         asked=cells.asked(config.methods, config.n_demos),
         seeds=config.seeds,
+        seeds_at_once=config.seeds_at_once,
         budget=budget_of(config, env),
         settings=config.settings,
         subset_size=max(config.n_demos),

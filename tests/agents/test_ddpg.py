@@ -26,7 +26,7 @@ from tests.support.agents import (
 def plain_gradient_descent(hparams=None, **kwargs):
     """An agent whose parameters move by exactly minus the gradient."""
     hparams = hparams or DDPGHParams(pre_activation_penalty=0.1, behaviour_cloning=0.7)
-    return ddpg.make(
+    agent = ddpg.make(
         SPEC,
         hparams,
         networks=SMALL,
@@ -34,6 +34,7 @@ def plain_gradient_descent(hparams=None, **kwargs):
         critic_optimizer=optax.sgd(1.0),
         **kwargs,
     )
+    return agent._replace(update=jax.jit(agent.update, static_argnames=("update_targets", "clone")))
 
 
 @pytest.mark.parametrize("q_filter", [False, True])
@@ -46,7 +47,7 @@ def test_gradients_equal_finite_differences_of_a_float64_reference(q_filter):
     target = agent.init(jax.random.key(1))
     before = before.replace(target_actor=target.actor, target_critic=target.critic)
     batch, demonstrations = random_batch(jax.random.key(2), 16), random_batch(jax.random.key(3), 6)
-    after, info = jax.jit(agent.update)(before, batch, demonstrations)
+    after, info = agent.update(before, batch, demonstrations)
 
     next_action = np.tanh(
         reference_pre_activation(reference.float64(before.target_actor), batch.next_observation)
@@ -93,14 +94,18 @@ def test_actor_gradient_is_the_deterministic_policy_gradient():
     before = agent.init(jax.random.key(0))
     batch = random_batch(jax.random.key(1), 8)
     after, _ = agent.update(before, batch)
-    action, mu_vjp = jax.vjp(
-        lambda actor: agent.act(before.replace(actor=actor), batch.observation), before.actor
-    )
-    value_slope = jax.vmap(jax.grad(lambda a, s: agent.value(after, s, a)))(
-        action, batch.observation
-    )
-    (ascent,) = mu_vjp(value_slope / 8)
-    expected = jax.tree.map(jnp.add, before.actor, ascent)
+
+    @jax.jit
+    def ascent():
+        action, mu_vjp = jax.vjp(
+            lambda actor: agent.act(before.replace(actor=actor), batch.observation), before.actor
+        )
+        value_slope = jax.vmap(jax.grad(lambda a, s: agent.value(after, s, a)))(
+            action, batch.observation
+        )
+        return mu_vjp(value_slope / 8)[0]
+
+    expected = jax.tree.map(np.add, before.actor, ascent())
     chex.assert_trees_all_close(after.actor, expected, rtol=1e-4, atol=1e-6)
 
 
@@ -120,7 +125,9 @@ def test_targets_move_by_tau_only_when_told():
     before, batch = agent.init(jax.random.key(0)), random_batch(jax.random.key(1), 4)
     moved, _ = agent.update(before, batch)
     expected = jax.tree.map(
-        lambda new, old: 0.25 * new + 0.75 * old, moved.critic, before.target_critic
+        lambda new, old: 0.25 * np.asarray(new) + 0.75 * np.asarray(old),
+        moved.critic,
+        before.target_critic,
     )
     chex.assert_trees_all_close(moved.target_critic, expected, rtol=1e-6)
     kept, _ = agent.update(before, batch, update_targets=False)
@@ -138,7 +145,8 @@ def test_tau_of_one_copies():
 def test_traced_predicates_do_what_python_ones_do_and_stay_branches_under_vmap():
     agent = ddpg.make(SPEC, networks=SMALL)
     states = jax.vmap(agent.init)(jax.random.split(jax.random.key(0), 3))
-    batches = jax.vmap(lambda key: random_batch(key, 4))(jax.random.split(jax.random.key(1), 3))
+    each = [random_batch(jax.random.key(seed), 4) for seed in range(1, 4)]
+    batches = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
 
     def update(state, batch, actor, targets, clone):
         predicates = {"update_actor": actor, "update_targets": targets, "clone": clone}

@@ -1,6 +1,7 @@
 """A small agent on the car, random batches, and its float64 reference."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax import envs, networks
@@ -15,18 +16,19 @@ SMALL = networks.make(SPEC, ARCHITECTURE)
 
 
 def random_batch(key, size, spec=SPEC):
-    keys = jax.random.split(key, 5)
+    """Drawn by numpy, which compiles nothing."""
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     low, high = spec.observation_low, spec.observation_high
-
-    def observations(key):
-        return jax.random.uniform(key, (size, spec.observation_dim), minval=low, maxval=high)
-
-    return Transition(
-        observation=observations(keys[0]),
-        action=jax.random.uniform(keys[1], (size, spec.action_dim), minval=-1.0, maxval=1.0),
-        reward=jax.random.normal(keys[2], (size,)),
-        next_observation=observations(keys[3]),
-        terminated=jax.random.bernoulli(keys[4], 0.3, (size,)),
+    shape = (size, spec.observation_dim)
+    batch = Transition(
+        observation=rng.uniform(low, high, shape),
+        action=rng.uniform(-1.0, 1.0, (size, spec.action_dim)),
+        reward=rng.normal(size=size),
+        next_observation=rng.uniform(low, high, shape),
+        terminated=rng.random(size) < 0.3,
+    )
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, None if leaf.dtype == bool else jnp.float32), batch
     )
 
 

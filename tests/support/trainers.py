@@ -50,7 +50,7 @@ def with_(settings=SMALL, **changes):
 @functools.cache
 def compiled(method, settings=SMALL, capacity=400):
     trainer = training.make(ENV, METHODS[method], settings, capacity=capacity)
-    return trainer, jax.jit(trainer.init, static_argnums=2), jax.jit(trainer.run)
+    return trainer, trainer.init, jax.jit(trainer.run)
 
 
 def start(method, settings=SMALL, key=0, **kwargs):

@@ -191,7 +191,7 @@ def _size(rewards: Rewards, steps: Transition) -> np.ndarray:
 def _program(
     plan: Plan, settings: Settings, pay: Callable[..., jax.Array] | None
 ) -> Callable[..., Evaluation]:
-    """Trains agents on rewards of one function: `(keys, (scale, params)), [R, ...] -> Evaluation`."""
+    """Trains agents on rewards of one function: `((keys, (scale, params))) -> Evaluation`."""
     physics = jax.tree.map(lambda *leaves: np.stack(leaves), *plan.physics.values())
 
     def scaled(params: Any, observation: jax.Array, action: jax.Array) -> jax.Array:

@@ -168,7 +168,12 @@ def any_begun(folder: Path) -> bool:
 
 
 def missing_blocks(
-    folder: Path, keys: Iterable[CellKey], method: str, n_demos: int, seeds: int
+    folder: Path,
+    keys: Iterable[CellKey],
+    method: str,
+    n_demos: int,
+    seeds: int,
+    at_once: int | None = None,
 ) -> list[range]:
     """The blocks of seeds that have to be trained so that there are `seeds` of them, in order.
 
@@ -180,6 +185,7 @@ def missing_blocks(
         method: the method's name.
         n_demos: demonstrations of each seed.
         seeds: how many are asked for.
+        at_once: the most of a new block; None: as many as there are.
     """
     done = {
         key.first_seed: key.seeds for key in keys if (key.method, key.n_demos) == (method, n_demos)
@@ -193,7 +199,7 @@ def missing_blocks(
     while first < seeds:
         size = done.get(first)
         if size is None:
-            size = begun.get(first, seeds)
+            size = begun.get(first, at_once or seeds)
             size = size if first + size <= seeds else seeds - first
             blocks.append(range(first, first + size))
         first += size

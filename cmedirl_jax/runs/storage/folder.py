@@ -40,7 +40,7 @@ _LOCK = ".lock"
 NOT_COMPARED = (
     *("out", "grid", "devices", "distributed", "coordinator", "processes", "process_id"),
     *("checkpoint_every", "check_demos", "demos_format", "demos_actions", "asynchronous"),
-    *("log", "log_seeds"),
+    *("log", "log_seeds", "seeds_at_once"),
     *CELLS_ASKED,
 )
 """The options that runs of one configuration may differ in."""

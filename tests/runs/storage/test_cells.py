@@ -95,8 +95,8 @@ def test_a_method_without_demonstrations_has_one_cell():
     assert names == ["ddpg-seeds-0-99", "me-ddpg-n1-seeds-0-99", "me-ddpg-n10-seeds-0-99"]
 
 
-def missing(folder, seeds, method="me-ddpg", n_demos=5):
-    return cells.missing_blocks(folder, keys(folder), method, n_demos, seeds)
+def missing(folder, seeds, method="me-ddpg", n_demos=5, at_once=None):
+    return cells.missing_blocks(folder, keys(folder), method, n_demos, seeds, at_once)
 
 
 def test_seeds_are_trained_in_blocks_and_never_twice(tmp_path):
@@ -119,6 +119,13 @@ def test_a_block_that_has_a_checkpoint_stays_as_it_was_begun(tmp_path):
     # Fewer seeds than it has are another block.
     assert missing(tmp_path, 3) == [range(3)]
     assert missing(tmp_path, 10, n_demos=50) == [range(10)]
+
+
+def test_a_new_block_has_no_more_seeds_than_train_at_once(tmp_path):
+    save(tmp_path, "me-ddpg", 5, 0, 4)
+    (tmp_path / "checkpoints" / "me-ddpg-n5-seeds-4-8").mkdir(parents=True)
+    assert missing(tmp_path, 14, at_once=3) == [range(4, 9), range(9, 12), range(12, 14)]
+    assert missing(tmp_path, 3, method="hs-ddpg", at_once=3) == [range(3)]
 
 
 @pytest.fixture
