@@ -5,6 +5,9 @@ from experiments import check_command
 COMMANDS = (
     "seeds_per_second",
     "peers",
+    "irl_peers",
+    "irl_ours",
+    "gail_ours",
     "profile",
     "main_job",
     "checkpoint_cost",

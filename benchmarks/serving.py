@@ -45,7 +45,8 @@ def serve(advance: Callable[[int], Any], steps: int, facts: Callable[[], dict] =
     """Time `advance(steps)` for every line of standard input, which holds the steps, until it ends.
 
     Args:
-        advance: takes that many steps with every learner, and returns when they are done.
+        advance: takes that many steps with every learner, and returns when they are done; if it
+            returns a dict, its fields are answered too.
         steps: of the first call, which compiles and is not counted.
         facts: further fields of the report after the first call.
     """
@@ -61,14 +62,17 @@ def serve(advance: Callable[[int], Any], steps: int, facts: Callable[[], dict] =
         answer({"first_call_seconds": first, **facts()})
         for line in sys.stdin:
             began = time.perf_counter()
-            advance(int(line))
+            found = advance(int(line))
             seconds = time.perf_counter() - began
-            answer({"seconds": seconds, "peak_memory_bytes": _peak()})
+            fields = found if isinstance(found, dict) else {}
+            answer({"seconds": seconds, "peak_memory_bytes": _peak(), **fields})
 
 
-def serve_from_command_line(advance: Callable[[int], Any]) -> None:
+def serve_from_command_line(
+    advance: Callable[[int], Any], facts: Callable[[], dict] = dict
+) -> None:
     """`serve`, with the steps of the first call as the command's last argument."""
-    serve(advance, int(sys.argv[-1]))
+    serve(advance, int(sys.argv[-1]), facts)
 
 
 class Worker:
@@ -108,13 +112,17 @@ class Worker:
 
     def seconds(self, steps: int) -> float:
         """How long the learners take for `steps` steps each, after the first call."""
+        return self.ask(steps)["seconds"]
+
+    def ask(self, steps: int) -> dict[str, Any]:
+        """Let the learners take `steps` steps each, after the first call; what the loop answers."""
         self.wait()
         assert self._process.stdin is not None
         self._process.stdin.write(f"{steps}\n")
         self._process.stdin.flush()
         answer = self._answer()
         self.peak_memory_bytes = answer["peak_memory_bytes"]
-        return answer["seconds"]
+        return answer
 
     def stop(self) -> None:
         """End the process."""
