@@ -25,6 +25,8 @@ from cmedirl_jax.runs.storage import outputs
 from cmedirl_jax.training.methods import PAPER_METHODS
 
 SEEDS = (1, 8, 32, 100, 1000)
+SCALE = (1, 10, 100, 1_000, 10_000)
+"""Seeds of the suite that looks at nothing else."""
 WIDTHS = ((64, 64), (128, 128), (400, 300))
 
 
@@ -86,7 +88,10 @@ def suites(devices: int, methods: Sequence[str], quick: bool) -> Iterator[Suite]
     # Ours against ours: what costs what.
     ours = Workload()
     yield _methods(methods)
-    yield Suite("scale", [ours, Workload(seeds=1000)], [("1,000 seeds / 100 seeds", 1, 0)])
+    at_100 = SCALE.index(100)
+    ratios = [(f"{seeds:,} seeds / 100 seeds", i, at_100) for i, seeds in enumerate(SCALE)]
+    del ratios[at_100]
+    yield Suite("scale", [Workload(seeds=seeds) for seeds in SCALE], ratios)
     if devices > 1:
         for method in methods:
             one = Workload(method=method)
