@@ -1,5 +1,6 @@
 """Figures in files, drawn alike on every machine; what cannot be drawn does not end a command."""
 
+import contextlib
 import io
 import os
 from collections.abc import Callable, Sequence
@@ -43,7 +44,11 @@ def save(figure: Callable[[], Figure], files: Sequence[Path], say: Callable[[str
                 drawn.savefig(buffer, format=kind, dpi=150, metadata=metadata)
                 outputs.write(path, buffer.getvalue())
     except Exception as error:
-        # Drawing depends on this machine's fonts; what was measured stands without a figure.
+        # Drawing depends on this machine's fonts; what was measured stands without a figure, and an
+        # earlier one would show other numbers.
+        for path in files:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         say(f"{files[0].name} is not drawn ({reason})")
         return False

@@ -71,6 +71,7 @@ def page(
         "<h2>Results</h2>",
         _results(summary, by_episodes),
         *(markup.figure(figures[name], CAPTIONS[name]) for name in CAPTIONS if name in figures),
+        _rewards(config),
         _made(config, versions),
     ]
     return markup.document(title, parts)
@@ -111,6 +112,16 @@ def _results(summary: pl.DataFrame, by_episodes: bool) -> str:
             ]
         )
     return markup.table(heads, rows)
+
+
+def _rewards(config: Mapping[str, Any]) -> str:
+    if not any(METHODS[method].reward for method in config["methods"]):
+        return ""
+    return (
+        "<h2>The learned rewards</h2><p>What they are worth says "
+        f'<a href="{run_folder.REWARD}/report.html">a page of its own</a>, which '
+        "<code>cmedirl reward</code> writes.</p>"
+    )
 
 
 def _made(config: Mapping[str, Any], versions: Mapping[str, str]) -> str:

@@ -144,6 +144,8 @@ def of_run(run: RewardedRun, plan: Plan, say: Callable[[str], None]) -> Iterator
         for each in run.learners
     ]
     size = float(np.median([each.size.mean() for each in learned]))
+    sizes = ", ".join(f"{each.size.mean():.2g} {each.method}" for each in learned)
+    say(f"Root mean squares as learned: {sizes}; as paid: {size:.2g}")
     settings, programs = run.learners[0].settings, {}
 
     def train(method: str, n_demos: int, seeds: np.ndarray, pay: Any, params: Any) -> pl.DataFrame:
@@ -290,5 +292,5 @@ def figure(rows: pl.DataFrame, seeds: pl.DataFrame, threshold: float | None) -> 
         axes.set_title(f"{world} physics" if world == OWN else world, fontsize=10)
         axes.set_xlabel("environment steps")
     panels[0].set_ylabel("return of $r_e$")
-    curves.legend(drawn, panels[0], columns=4)
+    curves.legend(drawn, panels[0], columns=2)
     return drawn

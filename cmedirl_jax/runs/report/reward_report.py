@@ -29,7 +29,8 @@ CAPTIONS = {
     "slices": "Learned rewards along one input, the others as they were demonstrated: the mean "
     "over the seeds, and the middle 90% of them.",
     "agreement": "How far the rewards of a method's seeds are from each other.",
-    "retraining": "Fresh agents that learn from each reward alone, judged by the task's own.",
+    "retraining": "Fresh agents that learn from each reward alone, all but the task's own scaled to "
+    "one root mean square, judged by the task's own.",
 }
 """What is written below each picture, in the page's order."""
 
@@ -141,7 +142,8 @@ def _page(run: Run, report: RewardReport, pictures: dict[str, Path]) -> str:
     title = f"The learned rewards of {run.config['env']}"
     parts = [
         f"<h1>{markup.text(title)}</h1>",
-        "<p>Means over the learners; brackets are 95% intervals.</p>",
+        "<p>Means over the learners; brackets are 95% intervals. "
+        '<a href="../report.html">The run</a>.</p>',
         "<h2>What the rewards know</h2>",
         _table(report.summary, "measure", ("mean", "low", "high")),
         markup.definitions(reward_cards.MEASURES),
