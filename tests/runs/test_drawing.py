@@ -36,6 +36,8 @@ def test_what_cannot_be_drawn_or_written_is_a_line(tmp_path):
         raise KeyError("two\nlines")
 
     lines = []
+    # What was drawn before, of other numbers, does not stay.
+    (tmp_path / "one.png").touch()
     assert not drawing.save(broken, [tmp_path / "one.png"], lines.append)
     (tmp_path / "file").touch()
     assert not drawing.save(figure, [tmp_path / "file" / "two.png"], lines.append)

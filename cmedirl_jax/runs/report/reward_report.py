@@ -29,8 +29,8 @@ CAPTIONS = {
     "slices": "Learned rewards along one input, the others as they were demonstrated: the mean "
     "over the seeds, and the middle 90% of them.",
     "agreement": "How far the rewards of a method's seeds are from each other.",
-    "retraining": "Fresh agents that learn from each reward alone, all but the task's own scaled to "
-    "one root mean square, judged by the task's own.",
+    "retraining": "Fresh agents that learn from each reward alone, judged by the task's own; all "
+    "others are scaled to one root mean square.",
 }
 """What is written below each picture, in the page's order."""
 

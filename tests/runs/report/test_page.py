@@ -32,16 +32,17 @@ def summary():
 
 
 class Reader(html.parser.HTMLParser):
-    """Notes tags that are not closed, and what is shown."""
+    """Notes tags that are not closed, what is shown, what is loaded and what is linked."""
 
     def __init__(self):
         super().__init__()
-        self.open, self.shown, self.loaded = [], [], []
+        self.open, self.shown, self.loaded, self.linked = [], [], [], []
 
     def handle_starttag(self, tag, attrs):
         if tag not in ("meta", "img"):
             self.open.append(tag)
-        self.loaded += [value for name, value in attrs if name in ("src", "href")]
+        to = self.linked if tag == "a" else self.loaded
+        to += [value for name, value in attrs if name in ("src", "href")]
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
@@ -74,6 +75,12 @@ def test_the_page_loads_nothing_and_runs_nothing(summary, tmp_path):
     text = page.page(CONFIG, summary, 90.0, {}, {})
     assert "<script" not in text
     assert "http" not in text
+
+
+def test_the_page_of_learned_rewards_is_linked(summary):
+    assert read(page.page(CONFIG, summary, 90.0, {}, {})).linked == ["reward/report.html"]
+    without = CONFIG | {"methods": ["ddpg", "hs-ddpg"]}
+    assert read(page.page(without, summary, 90.0, {}, {})).linked == []
 
 
 def test_a_run_over_episodes_is_told_in_episodes(summary):
