@@ -14,6 +14,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+from gymnasium.wrappers import RescaleObservation
 from stable_baselines3 import DDPG
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
@@ -34,12 +35,18 @@ def returns(task, reward, mode, seed, steps):
     env = gymnasium.make(task)
     if mode != "r_e":
         env = LearnedReward(env, reward, mode)
+    # Networks, batches, noise and scale of observations are as this library's.
     zeros = np.zeros(env.action_space.shape)
-    noise = OrnsteinUhlenbeckActionNoise(zeros, zeros + 0.5)
-    # As wide as this library's networks, and with as large batches.
-    alike = {"policy_kwargs": {"net_arch": [64, 64]}, "batch_size": 32, "learning_starts": 200}
-    agent = DDPG("MlpPolicy", env, seed=seed, action_noise=noise, **alike)
-    judge, found = gymnasium.make(task), []
+    alike = {
+        "policy_kwargs": {"net_arch": [64, 64]},
+        "batch_size": 32,
+        "learning_starts": 200,
+        "tau": 0.01,
+        "action_noise": OrnsteinUhlenbeckActionNoise(zeros, zeros + 0.5, dt=1.0),
+    }
+    one = np.float32(1.0)
+    agent = DDPG("MlpPolicy", RescaleObservation(env, -one, one), seed=seed, **alike)
+    judge, found = RescaleObservation(gymnasium.make(task), -one, one), []
     judge.reset(seed=seed)
     for _ in range(4):
         agent.learn(steps // 4, reset_num_timesteps=False)

@@ -10,6 +10,7 @@ import tempfile
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.wrappers import TransformObservation
 from imitation.algorithms.adversarial.gail import GAIL
 from imitation.data.types import Transitions
 from imitation.data.wrappers import RolloutInfoWrapper
@@ -27,20 +28,33 @@ torch.set_num_threads(1)
 shown = dict(np.load(sys.argv[1]))
 # The last step of each episode.
 ends = np.append(np.diff(shown["episode"]) != 0, True)
+space = gymnasium.make(TASK).observation_space
+
+
+def scaled(observation: np.ndarray) -> np.ndarray:
+    """Within -1 and 1, as in our networks."""
+    return 2.0 * (observation - space.low) / (space.high - space.low) - 1.0
+
+
 demonstrations = Transitions(
-    obs=shown["observation"],
+    obs=scaled(shown["observation"]),
     acts=shown["action"],
     infos=np.array([{}] * len(shown["action"])),
-    next_obs=shown["next_observation"],
+    next_obs=scaled(shown["next_observation"]),
     dones=ends,
 )
 silent = logger.configure(tempfile.mkdtemp(), [])
 seeds = itertools.count()
 
 
+def task() -> gymnasium.Env:
+    """The task with scaled observations."""
+    return TransformObservation(gymnasium.make(TASK), scaled)
+
+
 def train(seed: int, steps: int) -> DDPG:
     """An agent after so many steps on the discriminator's reward alone."""
-    tasks = DummyVecEnv([lambda: RolloutInfoWrapper(gymnasium.make(TASK))])
+    tasks = DummyVecEnv([lambda: RolloutInfoWrapper(task())])
     tasks.seed(seed)
     agent = DDPG(
         "MlpPolicy",
@@ -51,7 +65,7 @@ def train(seed: int, steps: int) -> DDPG:
         learning_starts=200,
         tau=0.01,
         train_freq=1,
-        action_noise=OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.5)),
+        action_noise=OrnsteinUhlenbeckActionNoise(np.zeros(1), np.full(1, 0.5), dt=1.0),
         policy_kwargs={"net_arch": [64, 64]},
         device="cpu",
     )
@@ -79,7 +93,7 @@ def advance(steps: int) -> dict[str, list[float]]:
     """Train the next seed, and judge it by the task's reward."""
     seed = next(seeds)
     agent = train(seed, steps)
-    judge = gymnasium.make(TASK)
+    judge = task()
     judge.reset(seed=seed)
     mean, _ = evaluate_policy(agent, judge, n_eval_episodes=10, warn=False)
     return {"returns": [float(mean)]}

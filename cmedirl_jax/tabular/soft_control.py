@@ -107,7 +107,7 @@ def expected_visitation(
     stop: Stop | None = None,
     guess: jax.Array | None = None,
 ) -> jax.Array:
-    """E[mu](s, a) = sum_t gamma^t D_t(s) pi_t(a|s), `[S, A]` (Eq. 7, by dynamic programming).
+    """`E[mu](s, a)` = sum_t gamma^t D_t(s) pi_t(a|s), `[S, A]` (Eq. 7, by dynamic programming).
 
     D_{t+1}(s') = sum_{s,a} D_t(s) pi_t(a|s) P(s'|s,a). Absorbing states count no visits.
 

@@ -1,6 +1,7 @@
 """The programs that people copy."""
 
 import importlib.util
+import json
 import subprocess
 import sys
 
@@ -12,6 +13,12 @@ import pytest
 from cmedirl_jax import envs
 from cmedirl_jax.io import export
 from tests.support import ROOT
+
+SIZES = {"observation": 4, "action": 2}
+PROGRAMS = (
+    *("own_task", "ddpg_in_a_scan", "irl_in_another_loop", "population"),
+    "reward_without_the_library",
+)
 
 
 def example(name):
@@ -42,6 +49,48 @@ def test_a_loop_of_ones_own_learns_from_a_reward_that_was_carried_away(tmp_path)
     # From the discs and the way there to the goal and its bonus.
     assert paid[:5].mean() < -0.05
     assert paid[-10:].mean() > 0.0
+
+
+def test_a_reward_that_was_carried_away_needs_numpy_alone(tmp_path):
+    carry(tmp_path / "r_d", envs.make("PointMass-v0"))
+    card = tmp_path / "r_d" / "card.json"
+    spaces = {name: {"low": [-1.0] * n, "high": [1.0] * n} for name, n in SIZES.items()}
+    card.write_text(json.dumps(json.loads(card.read_text()) | spaces))
+    program = (sys.executable, "-I", ROOT / "examples" / "reward_without_the_library.py")
+    blocked = "import sys; sys.modules['jax'] = sys.modules['cmedirl_jax'] = None; "
+    run = f"import runpy; sys.argv = {[str(program[2]), str(tmp_path / 'r_d')]}; "
+    code = blocked + run + "runpy.run_path(sys.argv[0], run_name='__main__')"
+    done = subprocess.run([*program[:2], "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("PointMass-v0: r_D is -0.1")
+
+
+def test_a_reward_is_learned_on_a_task_of_ones_own():
+    pilot, before, after = example("own_task").main(seeds=2, steps=1_500)
+    assert before < 3.0 * pilot
+    assert after > 0.6 * before
+
+
+def test_ddpg_learns_in_a_scan_of_ones_own():
+    first, last = example("ddpg_in_a_scan").main(steps=3_000, seeds=2)
+    assert last > first + 0.5
+
+
+def test_another_agent_learns_from_the_irl_update():
+    shown, before, after = example("irl_in_another_loop").main(generations=60)
+    assert before < 0.1 * shown
+    assert after > before + 0.5
+
+
+def test_a_population_breeds_its_hyperparameters():
+    population = example("population")
+    population.AGENTS = 8
+    first, last = population.main(generations=3, steps=400)
+    assert last > first
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_the_five_programs_are_short(name):
+    assert len((ROOT / "examples" / f"{name}.py").read_text().splitlines()) <= 60
 
 
 def test_stable_baselines_trains_on_it(tmp_path):
