@@ -15,6 +15,7 @@ COMMANDS = (
     "scaling",
     "coverage",
     "gymnasium_tasks",
+    "host_tasks",
     "worker",
 )
 

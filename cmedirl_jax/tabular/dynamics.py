@@ -50,7 +50,9 @@ def next_distribution(dynamics: Dynamics, visits: jax.Array) -> jax.Array:
     if isinstance(dynamics, SparseDynamics):
         arriving = dynamics.probability * visits[..., None]
         return jnp.zeros(visits.shape[0], arriving.dtype).at[dynamics.next_state].add(arriving)
-    return jnp.einsum("sa,sat->t", visits, dynamics)
+    # A product of a vector and a matrix, which XLA knows better than a sum over two axes.
+    dynamics = jnp.asarray(dynamics)
+    return visits.reshape(-1) @ dynamics.reshape(visits.size, -1)
 
 
 def probability_of(

@@ -6,7 +6,7 @@ start is seeded by the learner's key and the step before it, so that a seed's nu
 on the others nor on whether it was interrupted between two episodes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +17,7 @@ from gymnasium.vector import VectorEnv
 from cmedirl_jax import observation_statistics
 from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.envs import Step, stepping
-from cmedirl_jax.training import initialise, seeds
+from cmedirl_jax.training import initialise
 from cmedirl_jax.training import step as step_lib
 from cmedirl_jax.training.initialise import TrainingState
 from cmedirl_jax.training.step import Behaviour, Log
@@ -29,7 +29,6 @@ class Halves(NamedTuple):
     """A trainer's halves of a step over `S` seeds, compiled.
 
     Attributes:
-        sharding: how the states lie on the devices; those of another make it compile again.
         behave: `(states, step) -> Behaviour` `[S, ...]`, at step number `step`.
         learn: `(states, (behaviour, answer, next_start), step, pool, max_episodes) ->
             (TrainingState, Log, Behaviour)`: learns from the answers to step number `step`, and
@@ -41,7 +40,6 @@ class Halves(NamedTuple):
         max_episode_steps: steps after which an episode is cut.
     """
 
-    sharding: jax.sharding.Sharding
     behave: Callable[[TrainingState, Any], Behaviour]
     learn: Callable[..., tuple[TrainingState, Log, Behaviour]]
     first_seeds: Callable[[jax.Array], jax.Array]
@@ -50,20 +48,17 @@ class Halves(NamedTuple):
     max_episode_steps: int
 
 
-def compile_halves(
-    trainer: Trainer, max_episode_steps: int, devices: Sequence[Any] | None = None
-) -> Halves:
-    """Jit a trainer's halves of a step, over seeds that `devices` share; default the first one."""
-    over = list(devices or jax.local_devices()[:1])
+def compile_halves(trainer: Trainer, max_episode_steps: int) -> Halves:
+    """Jit a trainer's halves of a step over seeds; they run on the device where the states are."""
 
     def spread(function: Callable[..., Any]) -> Callable[..., Any]:
-        """`function(seed, *shared)` over seeds and devices."""
+        """`function(seed, *shared)` over seeds."""
 
         def mapped(of_seeds: Any, *shared: Any) -> Any:
             in_axes = (0, *(None for _ in shared))
             return jax.vmap(function, in_axes=in_axes)(of_seeds, *shared)
 
-        return seeds.map_devices(mapped, over)
+        return mapped
 
     def behave(state: TrainingState, step: jax.Array) -> Behaviour:
         draws = trainer.draw(state.key, state.subset, step, False)
@@ -94,19 +89,16 @@ def compile_halves(
     def begin_episode(seed: tuple[TrainingState, jax.Array], step: jax.Array) -> TrainingState:
         return _begin_episode(trainer, *seed, step)
 
-    # The same sharding everywhere: JAX compiles again for another one, even if it is equivalent.
-    split, learn_all = seeds.sharding(over), spread(learn)
+    learn_all = spread(learn)
     return Halves(
-        sharding=split,
-        behave=jax.jit(spread(behave), out_shardings=split),
+        behave=jax.jit(spread(behave)),
         learn=jax.jit(
             lambda states, answered, *shared: learn_all((states, *answered), *shared),
             donate_argnums=0,
-            out_shardings=split,
         ),
         first_seeds=jax.jit(spread(first_seed)),
         seeds=jax.jit(spread(seed)),
-        begin_episode=jax.jit(spread(begin_episode), out_shardings=split),
+        begin_episode=jax.jit(spread(begin_episode)),
         max_episode_steps=max_episode_steps,
     )
 
@@ -154,7 +146,7 @@ def begin(
     def of_seed(key: jax.Array, start: jax.Array) -> TrainingState:
         return trainer.init(key, data, n_demonstrations, None, (None, start))
 
-    return jax.jit(jax.vmap(of_seed), out_shardings=halves.sharding)(keys, first)
+    return jax.jit(jax.vmap(of_seed))(keys, first)
 
 
 def run(

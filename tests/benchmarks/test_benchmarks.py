@@ -17,6 +17,7 @@ from benchmarks import (
     checkpoint_cost,
     coverage,
     gymnasium_tasks,
+    host_tasks,
     main_job,
     measuring,
     naive,
@@ -486,3 +487,17 @@ def test_vectors_and_learners_of_gymnasiums_tasks_are_timed_in_turn(tmp_path, mo
         )
         ratios = sorted(x / y for x, y in zip(ours, theirs, strict=True))
         assert ratios[0] <= gain <= ratios[-1]
+
+
+def test_the_phases_and_rates_of_a_task_on_the_host_are_measured(tmp_path, monkeypatch, capsys):
+    # Three more programs to compile; the command's own tests train in the same way.
+    monkeypatch.setattr(host_tasks, "trainer", lambda *_, **__: lambda: None)
+    out = tmp_path / "host.json"
+    few = ["--steps", "30", "--seeds", "2", "--rounds", "2", "--out", str(out)]
+    assert host_tasks.main(["--tasks", "tests.support.host_tasks:Dock-v0", *few]) == 0
+    (entry,) = json.loads(out.read_text())["tasks"]
+    assert set(entry["microseconds"]) == {"simulator", "resets", "updates"}
+    assert all(0.0 < spent < 1e6 for spent in entry["microseconds"].values())
+    assert len(entry["rates"]) == 3
+    assert all(len(rates) == 2 and min(rates) > 0.0 for rates in entry["rates"].values())
+    assert "Dock-v0" in capsys.readouterr().out

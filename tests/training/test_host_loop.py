@@ -10,7 +10,7 @@ from cmedirl_jax import envs, training
 from cmedirl_jax.envs import stepping
 from cmedirl_jax.training import host_loop, seeds
 from cmedirl_jax.training.methods import METHODS
-from tests.support import trainers
+from tests.support import host_tasks, trainers
 from tests.support.trainers import LIMIT, SMALL, data
 
 SEEDS = 3
@@ -98,7 +98,7 @@ def test_an_episode_that_is_cut_off_is_no_trajectory():
 
 def test_an_interruption_between_two_episodes_changes_nothing():
     limit = 30
-    task = envs.from_gymnasium("Dock-v0", max_episode_steps=limit)
+    task = envs.from_gymnasium(host_tasks.Dock, max_episode_steps=limit)
     trainer = training.make(task, METHODS["ddpg"], SMALL, capacity=400)
     halves = host_loop.compile_halves(trainer, limit)
     ends = []

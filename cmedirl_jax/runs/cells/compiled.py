@@ -144,11 +144,11 @@ def compile_method(
     devices: Sequence[Any],
     capacity: int,
     subset_size: int | None,
-    vector: Callable[[int], VectorEnv] | None,
+    vectors: Sequence[Callable[[int], VectorEnv]] | None,
 ) -> CompiledMethod:
     """Jit a method's training, over seeds in groups and over devices. Compiles at first use.
 
-    `vector` makes the sub-environments of a task on the host.
+    `vectors` make the sub-environments of a task on the host, one for each device.
     """
     trainer = training.make(env, method, settings, capacity=capacity, subset_size=subset_size)
 
@@ -178,8 +178,9 @@ def compile_method(
     split = seeds.sharding(devices)
     slots = seeds.padded(seeds_count, group, len(devices))
     steps = None
-    if vector is not None:
-        steps = host.Steps(trainer, env.spec, functools.partial(vector, slots), devices)
+    if vectors is not None:
+        of_device = [functools.partial(vector, slots // len(devices)) for vector in vectors]
+        steps = host.Steps(trainer, env.spec, of_device, devices)
     return CompiledMethod(
         draw_networks=draw_networks,
         hot_start=hot_start,
@@ -271,7 +272,7 @@ def compiler(
 
     on_host = isinstance(env, HostEnv)
     # Cells follow each other, and share the sub-environments that they train in.
-    vector = host.Latest(env.vector) if on_host else None
+    vectors = [host.Latest(env.vector) for _ in devices] if isinstance(env, HostEnv) else None
 
     def group_of(architecture: Architecture, count: int) -> int:
         # One step of a task on the host is too short for groups to pay off.
@@ -309,7 +310,7 @@ def compiler(
             devices=devices,
             capacity=capacity,
             subset_size=subset_size,
-            vector=vector,
+            vectors=vectors,
         )
 
     return compile_once

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -38,24 +39,25 @@ class Latest:
 class Steps:
     """How the seeds of a method are stepped: `first`, `run` and `resume` of a `CompiledMethod`.
 
-    A simulator's state is not in the training state, so that a checkpoint lacks it: training goes
-    on from one at the start of an episode.
+    Each device has a thread that steps its share of the seeds: while one waits for its simulator,
+    another's updates run. A simulator's state is not in the training state, so that a checkpoint
+    lacks it: training goes on from one at the start of an episode.
     """
 
     def __init__(
         self,
         trainer: Trainer,
         spec: EnvSpec,
-        vector: Callable[[], VectorEnv],
+        vectors: Sequence[Callable[[], VectorEnv]],
         devices: Sequence[Any],
     ):
-        """The sub-environments, one a slot, are those that `vector` makes at its first call."""
-        self._vector = vector
-        self._halves = host_loop.compile_halves(trainer, spec.max_episode_steps, devices)
+        """The sub-environments, one a slot, are those that `vectors` make, one for each device."""
+        self._vectors, self._devices = vectors, devices
+        self._halves = host_loop.compile_halves(trainer, spec.max_episode_steps)
 
     def first(self, keys: jax.Array) -> tuple[None, np.ndarray]:
         """Begin the first episodes; the state, which is not here, and observations `[slots, O]`."""
-        return None, stepping.reset(self._vector(), np.asarray(self._halves.first_seeds(keys)))
+        return None, self._reset(np.asarray(self._halves.first_seeds(keys)))
 
     def run(
         self,
@@ -67,15 +69,60 @@ class Steps:
     ) -> tuple[TrainingState, Log]:
         """Step every slot: one group is all that a device has."""
         del groups
-        vector = self._vector()
-        return host_loop.run(self._halves, vector, state, data, np.asarray(steps), max_episodes)
+        numbers = np.asarray(steps)
+        # Not on the devices, each of which takes it.
+        limit: Any = None if max_episodes is None else np.asarray(max_episodes)
+
+        def step(device: Any, vector: Callable[[], VectorEnv]) -> tuple[TrainingState, Log]:
+            own, pool = _on(device, state), _on(device, data)
+            return host_loop.run(self._halves, vector(), own, pool, numbers, limit)
+
+        with ThreadPoolExecutor(len(self._devices)) as threads:
+            stepped = list(threads.map(step, self._devices, self._vectors))
+        states, logs = zip(*stepped, strict=True)
+        return _joined(state, states), jax.tree.map(lambda *leaves: np.concatenate(leaves), *logs)
 
     def resume(self, state: TrainingState, step: int) -> TrainingState:
         """Begin an episode in every slot."""
         before, now = np.int32(step - 1), np.int32(step)
-        seeds = np.asarray(self._halves.seeds(state, before))
-        observations = stepping.reset(self._vector(), seeds)
-        return self._halves.begin_episode((state, observations), now)
+        parts = [_on(device, state) for device in self._devices]
+        numbers = [np.asarray(self._halves.seeds(part, before)) for part in parts]
+        seen = np.split(self._reset(np.concatenate(numbers)), len(parts))
+        begun = [self._halves.begin_episode(both, now) for both in zip(parts, seen, strict=True)]
+        return _joined(state, begun)
+
+    def _reset(self, numbers: np.ndarray) -> np.ndarray:
+        """Reset every slot by its number `[slots]`: observations `[slots, O]`."""
+        shares = np.split(numbers, len(self._vectors))
+        return np.concatenate(
+            [
+                stepping.reset(vector(), share)
+                for vector, share in zip(self._vectors, shares, strict=True)
+            ]
+        )
+
+
+def _on(device: Any, tree: Any) -> Any:
+    """What a device holds of arrays that are split among devices, or copied to all of them."""
+
+    def local(leaf: Any) -> Any:
+        if isinstance(leaf, jax.Array):
+            for shard in leaf.addressable_shards:
+                if shard.device == device:
+                    return shard.data
+        return leaf
+
+    return jax.tree.map(local, tree)
+
+
+def _joined(like: Any, parts: Sequence[Any]) -> Any:
+    """The devices' parts as arrays that are split as `like` was."""
+
+    def join(whole: jax.Array, *leaves: jax.Array) -> jax.Array:
+        # The shape of a step's outputs is that of its inputs.
+        return jax.make_array_from_single_device_arrays(whole.shape, whole.sharding, leaves)
+
+    return jax.tree.map(join, like, *parts)
 
 
 def evaluator(env: HostEnv, architecture: Architecture, gather: Callable[[Any], Any]) -> Evaluator:
