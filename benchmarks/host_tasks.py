@@ -27,6 +27,7 @@ from cmedirl_jax.ranges import Size
 from cmedirl_jax.runs import start
 from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells.slots import Slots
+from cmedirl_jax.runs.cluster.base import ClusterOptions
 from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.training import host_loop, seeds
@@ -62,8 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = read(Options, "benchmarks.host_tasks", __doc__, arguments)
     if options.out is not None:
         measuring.outputs.check("out", options.out)
-    start.devices()
-    devices = jax.local_devices()
+    _, devices = start.start(ClusterOptions(), None, options.seeds, {})
     entries: list[dict[str, Any]] = []
     for name in options.tasks:
         variants = {
