@@ -39,9 +39,9 @@ class Latest:
 class Steps:
     """How the seeds of a method are stepped: `first`, `run` and `resume` of a `CompiledMethod`.
 
-    Each device has a thread that steps its share of the seeds: while one waits for its simulator,
-    another's updates run. A simulator's state is not in the training state, so that a checkpoint
-    lacks it: training goes on from one at the start of an episode.
+    Each device has a thread that steps its share of the seeds, the calling one for the first: while
+    one waits for its simulator, another's updates run. A simulator's state is not in the training
+    state, so that a checkpoint lacks it: training goes on from one at the start of an episode.
     """
 
     def __init__(
@@ -77,8 +77,11 @@ class Steps:
             own, pool = _on(device, state), _on(device, data)
             return host_loop.run(self._halves, vector(), own, pool, numbers, limit)
 
+        # One device starts no thread: a task may want the main one.
+        first, *others = zip(self._devices, self._vectors, strict=True)
         with ThreadPoolExecutor(len(self._devices)) as threads:
-            stepped = list(threads.map(step, self._devices, self._vectors))
+            stepping_others = [threads.submit(step, *share) for share in others]
+            stepped = [step(*first), *(share.result() for share in stepping_others)]
         states, logs = zip(*stepped, strict=True)
         return _joined(state, states), jax.tree.map(lambda *leaves: np.concatenate(leaves), *logs)
 
