@@ -7,6 +7,7 @@ every device with a thread each, and there with a process for each sub-environme
 """
 
 import dataclasses
+import functools
 import itertools
 import statistics
 import sys
@@ -20,13 +21,12 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from benchmarks import measuring
+from benchmarks import measuring, ours
 from cmedirl_jax import envs, training
-from cmedirl_jax.envs import HostEnv, stepping
+from cmedirl_jax.envs import HostEnv
 from cmedirl_jax.ranges import Size
 from cmedirl_jax.runs import start
 from cmedirl_jax.runs.cells import compiled as compiled_lib
-from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.runs.cluster.base import ClusterOptions
 from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.console.options import read
@@ -99,22 +99,13 @@ def trainer(
     env = _found(name, asynchronous=asynchronous)
     compile_once = compiled_lib.compiler(env, devices, capacity=CAPACITY, subset_size=None)
     programs = compile_once(METHODS["ddpg"], Settings(), options.seeds)
-    slots = Slots(programs.slots, options.seeds, programs.group, programs.devices)
-    state = compiled_lib.begin(programs, slots, jax.random.key(0), None, 0)
-    state, groups = compiled_lib.pack(programs, slots, state, np.ones(options.seeds, bool))
     # Past the first steps, which do not learn.
-    taken = Settings().schedule.learning_starts
-
-    def call() -> None:
-        nonlocal state, taken
-        numbers = np.arange(taken, taken + options.steps, dtype=np.int32)
-        state, _ = programs.run(state, groups, None, numbers, None)
-        taken += options.steps
-
+    first = Settings().schedule.learning_starts
+    advance = ours.stepping(programs, np.ones(options.seeds, bool), first=first)
     # Every episode has ended once, so that what begins the next one is compiled too.
     for _ in range(1 + env.spec.max_episode_steps // options.steps):
-        call()
-    return call
+        advance(options.steps)
+    return functools.partial(advance, options.steps)
 
 
 def phases(name: str, options: Options) -> dict[str, float]:
@@ -125,26 +116,26 @@ def phases(name: str, options: Options) -> dict[str, float]:
     halves = host_loop.compile_halves(made, env.spec.max_episode_steps)
     vector = env.vector(options.seeds)
     states = host_loop.begin(halves, made, vector, keys)
-    first = Settings().schedule.learning_starts
-    numbers = np.arange(first, first + env.spec.max_episode_steps, dtype=np.int32)
-    states, _ = host_loop.run(halves, vector, states, None, numbers)
-    behaviour = halves.behave(states, numbers[-1] + 1)
     spent: dict[str, float] = dict.fromkeys(map(str, PHASES), 0.0)
-    for step in numbers[-1] + 1 + np.arange(options.steps, dtype=np.int32):
-        times = [time.perf_counter()]
-        answer = stepping.step(vector, np.asarray(behaviour.action))
-        times.append(time.perf_counter())
-        ended, following = answer.terminated | answer.truncated, answer.observation
-        if ended.any():
-            starts = np.asarray(halves.seeds(states, step))
-            following = stepping.restart(vector, starts, ended, following)
-        times.append(time.perf_counter())
-        answered = (behaviour, answer, following)
-        states, _, behaviour = halves.learn(states, answered, step, None, None)
-        jax.block_until_ready((states, behaviour))
-        times.append(time.perf_counter())
-        for phase, seconds in zip(PHASES, np.diff(times), strict=True):
-            spent[phase] += 1e6 * float(seconds) / options.steps
+
+    def timed(phase: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            began = time.perf_counter()
+            found = jax.block_until_ready(function(*args, **kwargs))
+            spent[phase] += 1e6 * (time.perf_counter() - began) / options.steps
+            return found
+
+        return call
+
+    # The first episodes compile, and end.
+    begin = Settings().schedule.learning_starts
+    end = begin + env.spec.max_episode_steps
+    states, _ = host_loop.run(halves, vector, states, None, np.arange(begin, end, dtype=np.int32))
+    vector.step = timed("simulator", vector.step)
+    vector.reset = timed("resets", vector.reset)
+    halves = halves._replace(learn=timed("updates", halves.learn))
+    numbers = np.arange(end, end + options.steps, dtype=np.int32)
+    host_loop.run(halves, vector, states, None, numbers)
     return spent
 
 

@@ -7,6 +7,7 @@ import itertools
 import json
 import os
 import platform
+import re
 import shlex
 import statistics
 import sys
@@ -150,8 +151,10 @@ def one_core() -> list[int] | None:
 
 def heading(program: str) -> dict[str, Any]:
     """The first fields of every file of measurements."""
+    # Paths of this machine by their names alone.
+    arguments = [re.sub(r"^(--?[\w-]+=)?/.*/", r"\1", argument) for argument in sys.argv[1:]]
     return {
-        "command": f"python -m benchmarks.{program} " + shlex.join(sys.argv[1:]),
+        "command": f"python -m benchmarks.{program} " + shlex.join(arguments),
         "date": datetime.date.today().isoformat(),
         "machine": machine(),
         "versions": versions(),

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.workload import CAPACITY, Workload
 from cmedirl_jax import envs
-from cmedirl_jax.agents.hot_start import HotStartHParams
+from cmedirl_jax.agents.hot_start import HotStartData, HotStartHParams
 from cmedirl_jax.data.demonstrations import Demonstrations
 from cmedirl_jax.irl.reward_batches import RewardBatchSettings
 from cmedirl_jax.irl.rewards import RewardNetworkSettings
@@ -55,12 +55,31 @@ def start(workload: Workload, pool: Demonstrations) -> Callable[[int], None]:
     data = None
     if METHODS[workload.method].uses_demonstrations:
         data = pools.of_learners(pool, workload.seeds).data
-    slots = Slots(programs.slots, workload.seeds, programs.group, programs.devices)
-    state = compiled_lib.begin(programs, slots, jax.random.key(0), data, workload.n_demos)
     running = np.arange(workload.seeds) < round(workload.running * workload.seeds)
     active = np.random.default_rng(0).permutation(running)
+    return stepping(programs, active, data, workload.n_demos)
+
+
+def stepping(
+    programs: CompiledMethod,
+    active: np.ndarray,
+    data: HotStartData | None = None,
+    n_demos: int = 0,
+    first: int = 0,
+) -> Callable[[int], None]:
+    """A function that takes so many steps with every seed that is `active` `[seeds]`.
+
+    Args:
+        programs: the method's.
+        active: which seeds run.
+        data: the demonstrations, for a method that uses them.
+        n_demos: demonstrations of each seed.
+        first: number of the first step.
+    """
+    slots = Slots(programs.slots, len(active), programs.group, programs.devices)
+    state = compiled_lib.begin(programs, slots, jax.random.key(0), data, n_demos)
     state, groups = compiled_lib.pack(programs, slots, state, active)
-    taken = 0
+    taken = first
 
     def advance(steps: int) -> None:
         nonlocal state, taken

@@ -9,6 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
+RESULTS = ROOT / "docs" / "results"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 OTHER_PAGES = [ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "docs/results/README.md"]
 LINK = re.compile(r"\]\(([^)#\s]+\.\w+)[)#]")
@@ -65,6 +66,13 @@ def test_readmes_reward_prefers_what_the_demonstrator_does():
     opposite = learner.reward(state, shown.observation, -shown.action)
     assert jnp.mean(demonstrated > opposite) > 0.95
     assert names["info"].demonstration_reward[-1] > names["info"].background_reward[-1] + 0.05
+
+
+def test_no_result_names_a_path_of_some_machine():
+    results = [path for kind in ("json", "csv", "md", "txt") for path in RESULTS.rglob(f"*.{kind}")]
+    assert len(results) > 50
+    absolute = re.compile(r"(?<![\w.)\]/:*-])/(?:tmp|home|root|work|Users|var|mnt)/")
+    assert [path for path in results if absolute.search(path.read_text())] == []
 
 
 def test_there_are_examples():

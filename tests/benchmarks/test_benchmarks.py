@@ -226,6 +226,14 @@ def test_unknown_suites_and_methods_are_refused(fake_start, capsys, options, mes
     assert capsys.readouterr().err.startswith(f"seeds_per_second: {message}")
 
 
+def test_a_files_command_names_no_path_of_this_machine(monkeypatch):
+    given = ["--cells", "3", "--json", "/a/b c/one.json", "--out=/d/two.json", "docs/x.json"]
+    monkeypatch.setattr(sys, "argv", ["soak.py", *given])
+    command = measuring.heading("soak")["command"]
+    shown = "--cells 3 --json one.json --out=two.json docs/x.json"
+    assert command == f"python -m benchmarks.soak {shown}"
+
+
 def test_a_record_is_summed_up_by_its_median():
     record = Record(Workload(), [3.0, 12_000.0, 24_000.0], 5.0, None, "cpu").fields()
     assert record["learning_steps_per_second"] == 12_000.0
@@ -493,7 +501,8 @@ def test_the_phases_and_rates_of_a_task_on_the_host_are_measured(tmp_path, monke
     # Three more programs to compile; the command's own tests train in the same way.
     monkeypatch.setattr(host_tasks, "trainer", lambda *_, **__: lambda: None)
     out = tmp_path / "host.json"
-    few = ["--steps", "30", "--seeds", "2", "--rounds", "2", "--out", str(out)]
+    # As many steps as an episode has, so that one begins.
+    few = ["--steps", "60", "--seeds", "2", "--rounds", "2", "--out", str(out)]
     assert host_tasks.main(["--tasks", "tests.support.host_tasks:Dock-v0", *few]) == 0
     (entry,) = json.loads(out.read_text())["tasks"]
     assert set(entry["microseconds"]) == {"simulator", "resets", "updates"}
