@@ -64,12 +64,12 @@ def make(side: int, horizon: int, *, ends: bool) -> Problem:
     return Problem(transition, state, action, mask, last, *map(np.asarray, (0.05, first, ends)))
 
 
-def dynamics(side: int) -> np.ndarray:
-    """`[S, A, S]`: four moves, which end at the walls and go another way at times."""
+def dynamics(side: int, slip: float = SLIP) -> np.ndarray:
+    """`[S, A, S]`: four moves, which end at the walls and go another way by the chance `slip`."""
     chances = np.zeros((side * side, 4, side * side))
     for (row, column), action in itertools.product(np.ndindex(side, side), range(4)):
         for index, (down, right) in enumerate(MOVES):
             to = np.clip((row + down, column + right), 0, side - 1)
-            share = SLIP / 4 + (1.0 - SLIP) * (index == action)
+            share = slip / 4 + (1.0 - slip) * (index == action)
             chances[row * side + column, action, to[0] * side + to[1]] += share
     return chances

@@ -1,9 +1,8 @@
 """Small finite Markov decision processes, and slow float64 references for them."""
 
-import itertools
-
 import numpy as np
 
+from benchmarks import gridworlds
 from cmedirl_jax.tabular import SparseDynamics
 
 
@@ -35,14 +34,7 @@ def sparse(dynamics):
 def gridworld(size=5, slip=0.0):
     """`(dynamics, absorbing)`: four moves on `size` x `size` cells, the last one absorbing."""
     states = size * size
-    moves = [(0, 1), (1, 0), (0, -1), (-1, 0)]
-    dynamics = np.zeros((states, 4, states))
-    for (row, column), action in itertools.product(np.ndindex(size, size), range(4)):
-        for index, (down, right) in enumerate(moves):
-            to = np.clip((row + down, column + right), 0, size - 1)
-            share = slip / 4 + (1.0 - slip) * (index == action)
-            dynamics[row * size + column, action, to[0] * size + to[1]] += share
-    return dynamics, np.arange(states) == states - 1
+    return gridworlds.dynamics(size, slip), np.arange(states) == states - 1
 
 
 def soft_backups(dynamics, reward, discount, horizon, temperature=1.0, absorbing=None):
