@@ -154,7 +154,7 @@ def test_x64_and_vmap_give_the_numbers_that_one_call_gives():
     keys = jax.random.split(jax.random.key(1))
     one = jax.jit(function)
     expected = [one(key, BATCH) for key in keys]
-    together = jax.jit(jax.vmap(function, in_axes=(0, None)))(keys, BATCH)
+    together = jax.device_get(jax.jit(jax.vmap(function, in_axes=(0, None)))(keys, BATCH))
     for i, single in enumerate(expected):
         found = jax.tree.map(lambda leaf, i=i: leaf[i], together)
         chex.assert_trees_all_close(found, single, rtol=1e-5, atol=1e-6)

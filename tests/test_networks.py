@@ -1,6 +1,5 @@
 import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
@@ -13,10 +12,11 @@ NORMALISATIONS = ["none", "layer", "batch"]
 normalisations = pytest.mark.parametrize("normalisation", NORMALISATIONS)
 
 
-def randomised(variables):
+def randomised(network):
     """Random variables; running variances are positive, and no entry is zero or one."""
     rng = np.random.default_rng(0)
-    variables = jax.tree.map(lambda leaf: rng.normal(0.1, 0.7, leaf.shape), variables)
+    shapes = jax.eval_shape(network.init, KEY)
+    variables = jax.tree.map(lambda leaf: rng.normal(0.1, 0.7, leaf.shape), shapes)
     for statistics in variables.get("batch_stats", {}).values():
         statistics["var"] = np.exp(statistics["var"])
     return jax.tree.map(np.float32, variables)
@@ -75,11 +75,11 @@ def test_actor_is_the_perceptron(skewed_spec, normalisation, normalise_observati
         normalise_observation=normalise_observation,
     )
     actor = networks.make(skewed_spec, architecture).actor
-    variables = randomised(actor.init(KEY))
+    variables = randomised(actor)
     observation, _ = inputs(skewed_spec, 5)
     x = scaled(skewed_spec, observation) if normalise_observation == "bounds" else observation
     expected, _ = reference(float64(variables), x, normalisation=normalisation)
-    output = actor.apply(variables, observation)
+    output = jax.jit(actor.apply)(variables, observation)
     assert output.shape == (5, skewed_spec.action_dim)
     np.testing.assert_allclose(output, expected, rtol=1e-4, atol=1e-4)
 
@@ -91,7 +91,7 @@ def test_critic_is_the_perceptron(skewed_spec, normalisation, action_layer):
         hidden=(8, 6), critic_normalisation=normalisation, action_layer=action_layer
     )
     critic = networks.make(skewed_spec, architecture).critic
-    variables = randomised(critic.init(KEY))
+    variables = randomised(critic)
     observation, action = inputs(skewed_spec, 5)
     expected, _ = reference(
         float64(variables),
@@ -100,18 +100,18 @@ def test_critic_is_the_perceptron(skewed_spec, normalisation, action_layer):
         normalisation=normalisation,
         join=action_layer,
     )
-    output = critic.apply(variables, observation, action)
+    output = jax.jit(critic.apply)(variables, observation, action)
     assert output.shape == (5,)
     np.testing.assert_allclose(output, expected[..., 0], rtol=1e-4, atol=1e-4)
 
 
 def test_layer_normalisation_adds_1e_5_to_the_variance(skewed_spec):
     critic = networks.make(skewed_spec, Architecture(hidden=(8,))).critic
-    variables = jax.tree.map(lambda leaf: 0.003 * leaf, randomised(critic.init(KEY)))
+    variables = jax.tree.map(lambda leaf: 0.003 * leaf, randomised(critic))
     observation, action = inputs(skewed_spec, 5)
     x = scaled(skewed_spec, observation)
     expected, _ = reference(float64(variables), x, action, normalisation="layer")
-    output = critic.apply(variables, observation, action)
+    output = jax.jit(critic.apply)(variables, observation, action)
     np.testing.assert_allclose(output, expected[:, 0], rtol=1e-3)
 
 
@@ -119,21 +119,22 @@ def test_layer_normalisation_adds_1e_5_to_the_variance(skewed_spec):
 def test_leading_axes_are_mapped_over(skewed_spec, normalisation):
     architecture = Architecture(hidden=(8,), critic_normalisation=normalisation)
     critic = networks.make(skewed_spec, architecture).critic
-    variables = randomised(critic.init(KEY))
+    variables = randomised(critic)
     observation, action = inputs(skewed_spec, 2, 3)
-    output = critic.apply(variables, observation, action)
+    apply = jax.jit(critic.apply)
+    output = np.asarray(apply(variables, observation, action))
     assert output.shape == (2, 3)
     for index in np.ndindex(2, 3):
-        single = critic.apply(variables, observation[index], action[index])
+        single = apply(variables, observation[index], action[index])
         np.testing.assert_allclose(output[index], single, rtol=1e-5)
 
 
 def test_training_normalises_by_the_batch_and_moves_the_running_statistics(skewed_spec):
     architecture = Architecture(hidden=(8, 6), critic_normalisation="batch", action_layer=1)
     critic = networks.make(skewed_spec, architecture).critic
-    variables = randomised(critic.init(KEY))
+    variables = randomised(critic)
     observation, action = inputs(skewed_spec, 32)
-    output, moved = critic.train(variables, observation, action)
+    output, moved = jax.jit(critic.train)(variables, observation, action)
     expected, expected_moved = reference(
         float64(variables),
         scaled(skewed_spec, observation),
@@ -159,23 +160,25 @@ def test_only_batch_normalisation_has_statistics_to_train(skewed_spec, normalisa
 
 def test_train_mode_of_a_network_without_statistics_is_apply(skewed_spec):
     critic = networks.make(skewed_spec).critic
-    params = critic.init(KEY)
-    batch = inputs(skewed_spec, 4)
-    output, same = networks.train_mode(critic)(params, *batch)
-    np.testing.assert_array_equal(output, critic.apply(params, *batch))
-    assert same is params
+
+    @jax.jit
+    def both(params, *batch):
+        output, same = networks.train_mode(critic)(params, *batch)
+        assert same is params
+        return output, critic.apply(params, *batch)
+
+    np.testing.assert_array_equal(*both(randomised(critic), *inputs(skewed_spec, 4)))
 
 
 @pytest.mark.parametrize(("hidden", "action_layer"), [((), 0), ((8,), 0), ((8, 6), 1)])
 def test_critic_depends_on_the_action(skewed_spec, hidden, action_layer):
     architecture = Architecture(hidden=hidden, action_layer=action_layer)
     critic = networks.make(skewed_spec, architecture).critic
-    variables = randomised(critic.init(KEY))
+    variables = randomised(critic)
     observation, action = inputs(skewed_spec, 4)
-    assert jnp.all(
-        critic.apply(variables, observation, action)
-        != critic.apply(variables, observation, action + 0.1)
-    )
+    apply = jax.jit(critic.apply)
+    before, after = (apply(variables, observation, action + by) for by in np.float32([0.0, 0.1]))
+    assert np.all(np.asarray(before) != np.asarray(after))
 
 
 def test_initial_weights_are_uniform_in_their_ranges(skewed_spec):
@@ -186,7 +189,7 @@ def test_initial_weights_are_uniform_in_their_ranges(skewed_spec):
         (both.actor, (observation_dim, 200)),
         (both.critic, (observation_dim, 200 + action_dim)),
     ):
-        layers = network.init(KEY)["params"]
+        layers = jax.device_get(jax.jit(network.init)(KEY)["params"])
         bounds = [1 / np.sqrt(fan_in[0]), 1 / np.sqrt(fan_in[1]), 3e-3]
         for index, bound in enumerate(bounds):
             layer = layers[f"Dense_{index}"]
@@ -198,18 +201,17 @@ def test_initial_weights_are_uniform_in_their_ranges(skewed_spec):
 
 def test_output_scale_is_the_range_of_the_last_layer(skewed_spec):
     architecture = Architecture(hidden=(400,), output_scale=0.1)
-    kernel = networks.make(skewed_spec, architecture).critic.init(KEY)["params"]["Dense_1"][
-        "kernel"
-    ]
+    init = jax.jit(networks.make(skewed_spec, architecture).critic.init)
+    kernel = np.asarray(init(KEY)["params"]["Dense_1"]["kernel"])
     assert 0.09 < np.abs(kernel).max() <= 0.1
 
 
 def test_squashing_reaches_the_action_bounds(skewed_spec):
     squash = networks.make(skewed_spec).squash
     low, high = skewed_spec.action_low, skewed_spec.action_high
-    np.testing.assert_array_equal(squash(jnp.full(2, -20.0)), low)
-    np.testing.assert_array_equal(squash(jnp.full(2, 20.0)), high)
-    x = np.array([0.0, 0.5])
+    np.testing.assert_array_equal(squash(np.full(2, -20.0, np.float32)), low)
+    np.testing.assert_array_equal(squash(np.full(2, 20.0, np.float32)), high)
+    x = np.float32([0.0, 0.5])
     np.testing.assert_allclose(squash(x), (low + high) / 2 + (high - low) / 2 * np.tanh(x))
 
 

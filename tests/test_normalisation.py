@@ -16,6 +16,10 @@ from cmedirl_jax.observation_statistics import STATISTICS, Statistics
 from cmedirl_jax.types import Transition
 
 KEY = jax.random.key(0)
+begin_statistics = jax.jit(observation_statistics.begin)
+add_to_statistics = jax.jit(observation_statistics.add)
+of_running = jax.jit(observation_statistics.of_running)
+of_sample = jax.jit(observation_statistics.of_sample)
 
 
 @pytest.fixture
@@ -69,11 +73,11 @@ def test_features_over_the_bounds_refuse_senseless_ones(unbounded):
 
 @given(npst.arrays(np.float32, (7, 2), elements=st.floats(-100, 100, width=32)))
 def test_running_statistics_are_those_of_all_observations(observations):
-    running = observation_statistics.begin(observations[0])
-    assert observation_statistics.of_running(running).std.tolist() == [1.0, 1.0]
+    running = begin_statistics(observations[0])
+    assert of_running(running).std.tolist() == [1.0, 1.0]
     for observation in observations[1:]:
-        running = observation_statistics.add(running, observation)
-    found = observation_statistics.of_running(running)
+        running = add_to_statistics(running, observation)
+    found = jax.device_get(of_running(running))
     mean, std = (
         observations.mean(axis=0, dtype=np.float64),
         observations.std(axis=0, dtype=np.float64),
@@ -81,7 +85,7 @@ def test_running_statistics_are_those_of_all_observations(observations):
     np.testing.assert_allclose(found.mean, mean, rtol=1e-4, atol=1e-3)
     spread = std > 0.02 * np.maximum(np.abs(mean), 1.0)
     np.testing.assert_allclose(found.std[spread], std[spread], rtol=1e-2)
-    together = observation_statistics.of_sample(observations)
+    together = jax.device_get(of_sample(observations))
     np.testing.assert_allclose(together.std[spread], std[spread], rtol=1e-2)
 
 
@@ -103,22 +107,28 @@ def test_statistics_are_put_into_every_network_of_a_tree(unbounded):
 
 
 def batch(spec, size=5):
-    keys = jax.random.split(KEY, 3)
-    observation, following = jax.random.normal(keys[0], (2, size, spec.observation_dim))
-    action = jax.random.uniform(
-        keys[1], (size, spec.action_dim), minval=spec.action_low, maxval=spec.action_high
+    rng = np.random.default_rng(0)
+    observation, following = rng.normal(size=(2, size, spec.observation_dim)).astype(np.float32)
+    action = rng.uniform(spec.action_low, spec.action_high, (size, spec.action_dim))
+    done = np.zeros(size, bool)
+    return Transition(
+        observation, action.astype(np.float32), np.ones(size, np.float32), following, done
     )
-    return Transition(observation, action, jnp.ones(size), following, jnp.zeros(size, bool))
 
 
 def test_no_gradient_and_no_weight_decay_reach_the_statistics(unbounded):
     agent = ddpg.make(
         unbounded, actor_optimizer=optax.adamw(0.1), critic_optimizer=optax.adamw(0.1)
     )
-    params = tuple(network.init(KEY) for network in agent.networks[:2])
-    statistics = Statistics(jnp.arange(1.0, 4.0), jnp.full(3, 2.0))
-    state = agent.init(KEY, observation_statistics.put(params, statistics))
-    after, _ = agent.update(state, batch(unbounded))
+    statistics = Statistics(np.arange(1.0, 4.0, dtype=np.float32), np.full(3, 2.0, np.float32))
+
+    @jax.jit
+    def begin(key):
+        params = tuple(network.init(key) for network in agent.networks[:2])
+        return agent.init(key, observation_statistics.put(params, statistics))
+
+    state = begin(KEY)
+    after, _ = jax.device_get(jax.jit(agent.update)(state, batch(unbounded)))
     for name in ("actor", "critic", "target_actor", "target_critic"):
         kept = getattr(after, name)[STATISTICS]
         np.testing.assert_allclose(kept["mean"], statistics.mean, rtol=1e-6)
@@ -129,10 +139,10 @@ def test_no_gradient_and_no_weight_decay_reach_the_statistics(unbounded):
 
 
 def test_a_prior_is_of_weights_alone(unbounded):
-    params = rewards.mlp(unbounded, (4,)).init(KEY)
+    params = jax.jit(rewards.mlp(unbounded, (4,)).init)(KEY)
     moved = observation_statistics.put(params, Statistics(jnp.full(3, 50.0), jnp.full(3, 70.0)))
     assert regularisers.log_prior(params, 2.0) == regularisers.log_prior(moved, 2.0)
-    expected = -sum(float(jnp.sum(jnp.square(x))) for x in jax.tree.leaves(params["params"]))
+    expected = -sum(np.sum(np.square(x)) for x in jax.tree.leaves(params["params"]))
     assert float(regularisers.log_prior(moved, 2.0)) == pytest.approx(expected, rel=1e-5)
 
 

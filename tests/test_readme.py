@@ -1,17 +1,24 @@
 """The commands and the code of README and docs are what they say they are."""
 
+import functools
+import json
 import re
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 RESULTS = ROOT / "docs" / "results"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
-OTHER_PAGES = [ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "docs/results/README.md"]
+NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
+OTHER_PAGES = [
+    *(ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "docs/results/README.md"),
+    NOTEBOOK,
+]
 LINK = re.compile(r"\]\(([^)#\s]+\.\w+)[)#]")
 TEST = re.compile(r"(?<=[`/ ])(?:test_|\.\.\._)[a-z][\w.]*(?=`|: )")
 PATH = re.compile(r"`((?:cmedirl_jax|experiments|benchmarks|tests|docs)/[\w./-]*)`")
@@ -21,6 +28,7 @@ def blocks(page):
     return re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
 
 
+@functools.cache
 def run(code):
     names = {}
     exec(compile(code, "<example>", "exec"), names)
@@ -56,15 +64,16 @@ def test_the_examples_run(code, tmp_path, monkeypatch):
     arrays = [leaf for leaf in jax.tree.leaves(list(names.values())) if isinstance(leaf, jax.Array)]
     numbers = [leaf for leaf in arrays if jnp.issubdtype(leaf.dtype, jnp.floating)]
     assert numbers
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in numbers)
+    assert all(np.isfinite(np.asarray(leaf)).all() for leaf in numbers)
 
 
 def test_readmes_reward_prefers_what_the_demonstrator_does():
     names = run(blocks(README)[0])
     learner, state, shown = names["learner"], names["state"], names["shown"]
-    demonstrated = learner.reward(state, shown.observation, shown.action)
-    opposite = learner.reward(state, shown.observation, -shown.action)
-    assert jnp.mean(demonstrated > opposite) > 0.95
+    reward = jax.jit(learner.reward)
+    demonstrated = np.asarray(reward(state, shown.observation, shown.action))
+    opposite = np.asarray(reward(state, shown.observation, -np.asarray(shown.action)))
+    assert np.mean(demonstrated > opposite) > 0.95
     assert names["info"].demonstration_reward[-1] > names["info"].background_reward[-1] + 0.05
 
 
@@ -86,6 +95,16 @@ def test_links_and_paths_lead_somewhere(page):
     linked = [page.parent / link for link in LINK.findall(text) if "://" not in link]
     named = [ROOT / path for path in PATH.findall(text)]
     assert [path for path in linked + named if not path.exists()] == []
+
+
+def test_the_notebook_holds_the_outputs_of_one_run_from_top_to_bottom():
+    cells = [
+        cell for cell in json.loads(NOTEBOOK.read_text())["cells"] if cell["cell_type"] == "code"
+    ]
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    kinds = {output["output_type"] for cell in cells for output in cell["outputs"]}
+    assert kinds == {"stream", "display_data"}
+    assert NOTEBOOK.stat().st_size < 300_000
 
 
 def test_tests_that_are_named_exist():

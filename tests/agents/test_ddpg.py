@@ -1,3 +1,4 @@
+import functools
 import itertools
 
 import chex
@@ -22,32 +23,35 @@ from tests.support.agents import (
     reference_q,
 )
 
+# By exactly minus the gradient, with a state that counts its steps.
+PLAIN = optax.sgd(lambda count: 1.0)
+AGENT = ddpg.make(SPEC, networks=SMALL, actor_optimizer=PLAIN, critic_optimizer=PLAIN)
+# The hyperparameters are in the state, so agents of any share these programs.
+update = jax.jit(AGENT.update, static_argnames=("update_actor", "update_targets", "clone"))
+draw = jax.jit(lambda key: (SMALL.actor.init(key), SMALL.critic.init(jax.random.fold_in(key, 1))))
 
-def plain_gradient_descent(hparams=None, **kwargs):
-    """An agent whose parameters move by exactly minus the gradient."""
-    hparams = hparams or DDPGHParams(pre_activation_penalty=0.1, behaviour_cloning=0.7)
-    agent = ddpg.make(
-        SPEC,
-        hparams,
-        networks=SMALL,
-        actor_optimizer=optax.sgd(1.0),
-        critic_optimizer=optax.sgd(1.0),
-        **kwargs,
-    )
-    return agent._replace(update=jax.jit(agent.update, static_argnames=("update_targets", "clone")))
+
+def initial(hparams=None, seed=0):
+    agent = ddpg.make(SPEC, hparams, networks=SMALL, actor_optimizer=PLAIN, critic_optimizer=PLAIN)
+    key = jax.random.key(seed)
+    return agent.init(key, draw(key))
+
+
+def batches(seed=2):
+    """A batch, and demonstrations."""
+    return random_batch(jax.random.key(seed), 16), random_batch(jax.random.key(seed + 1), 6)
 
 
 @pytest.mark.parametrize("q_filter", [False, True])
 def test_gradients_equal_finite_differences_of_a_float64_reference(q_filter):
-    agent = plain_gradient_descent(
+    before = initial(
         DDPGHParams(pre_activation_penalty=0.1, behaviour_cloning=0.7, q_filter=q_filter)
     )
-    before = agent.init(jax.random.key(0))
     # Targets that differ from the parameters, so that exchanging the two would be noticed.
-    target = agent.init(jax.random.key(1))
+    target = initial(seed=1)
     before = before.replace(target_actor=target.actor, target_critic=target.critic)
-    batch, demonstrations = random_batch(jax.random.key(2), 16), random_batch(jax.random.key(3), 6)
-    after, info = agent.update(before, batch, demonstrations)
+    batch, demonstrations = batches()
+    after, info = update(before, batch, demonstrations)
 
     next_action = np.tanh(
         reference_pre_activation(reference.float64(before.target_actor), batch.next_observation)
@@ -90,20 +94,18 @@ def test_gradients_equal_finite_differences_of_a_float64_reference(q_filter):
 
 def test_actor_gradient_is_the_deterministic_policy_gradient():
     """Eq. 3: the chain rule through the action, written out."""
-    agent = plain_gradient_descent(DDPGHParams(pre_activation_penalty=0.0))
-    before = agent.init(jax.random.key(0))
-    batch = random_batch(jax.random.key(1), 8)
-    after, _ = agent.update(before, batch)
+    before, (batch, _) = initial(DDPGHParams(pre_activation_penalty=0.0)), batches()
+    after, _ = update(before, batch)
 
     @jax.jit
     def ascent():
         action, mu_vjp = jax.vjp(
-            lambda actor: agent.act(before.replace(actor=actor), batch.observation), before.actor
+            lambda actor: AGENT.act(before.replace(actor=actor), batch.observation), before.actor
         )
-        value_slope = jax.vmap(jax.grad(lambda a, s: agent.value(after, s, a)))(
+        value_slope = jax.vmap(jax.grad(lambda a, s: AGENT.value(after, s, a)))(
             action, batch.observation
         )
-        return mu_vjp(value_slope / 8)[0]
+        return mu_vjp(value_slope / 16)[0]
 
     expected = jax.tree.map(np.add, before.actor, ascent())
     chex.assert_trees_all_close(after.actor, expected, rtol=1e-4, atol=1e-6)
@@ -111,9 +113,8 @@ def test_actor_gradient_is_the_deterministic_policy_gradient():
 
 @pytest.mark.parametrize("printed", [False, True])
 def test_only_the_printed_algorithm_bootstraps_at_termination(printed):
-    agent = plain_gradient_descent(DDPGHParams(bootstrap_at_termination=printed))
-    state, batch = agent.init(jax.random.key(0)), random_batch(jax.random.key(1), 32)
-    targets = ddpg.td_targets(SMALL, state, batch)
+    state, (batch, _) = initial(DDPGHParams(bootstrap_at_termination=printed)), batches()
+    targets = jax.jit(functools.partial(ddpg.td_targets, SMALL))(state, batch)
     equals_reward = np.isclose(targets, batch.reward, atol=1e-6)
     ends = np.asarray(batch.terminated)
     assert not equals_reward[~ends].any()
@@ -121,65 +122,60 @@ def test_only_the_printed_algorithm_bootstraps_at_termination(printed):
 
 
 def test_targets_move_by_tau_only_when_told():
-    agent = plain_gradient_descent(DDPGHParams(tau=0.25))
-    before, batch = agent.init(jax.random.key(0)), random_batch(jax.random.key(1), 4)
-    moved, _ = agent.update(before, batch)
+    before, data = initial(DDPGHParams(tau=0.25)), batches()
+    moved, _ = update(before, *data)
     expected = jax.tree.map(
         lambda new, old: 0.25 * np.asarray(new) + 0.75 * np.asarray(old),
         moved.critic,
         before.target_critic,
     )
     chex.assert_trees_all_close(moved.target_critic, expected, rtol=1e-6)
-    kept, _ = agent.update(before, batch, update_targets=False)
+    kept, _ = update(before, *data, update_targets=False)
     chex.assert_trees_all_equal(kept.target_critic, before.target_critic)
     chex.assert_trees_all_equal(kept.target_actor, before.target_actor)
 
 
 def test_tau_of_one_copies():
-    agent = plain_gradient_descent(DDPGHParams(tau=1.0))
-    state, _ = agent.update(agent.init(jax.random.key(0)), random_batch(jax.random.key(1), 4))
+    state, _ = update(initial(DDPGHParams(tau=1.0)), *batches())
     chex.assert_trees_all_close(state.target_actor, state.actor, rtol=0, atol=0)
     chex.assert_trees_all_close(state.target_critic, state.critic, rtol=0, atol=0)
 
 
 def test_traced_predicates_do_what_python_ones_do_and_stay_branches_under_vmap():
-    agent = ddpg.make(SPEC, networks=SMALL)
-    states = jax.vmap(agent.init)(jax.random.split(jax.random.key(0), 3))
-    each = [random_batch(jax.random.key(seed), 4) for seed in range(1, 4)]
-    batches = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+    names = ("update_actor", "update_targets", "clone")
+    hparams = DDPGHParams(behaviour_cloning=0.7)
+    each = [(initial(hparams, seed), batches(seed)) for seed in range(3)]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
 
-    def update(state, batch, actor, targets, clone):
-        predicates = {"update_actor": actor, "update_targets": targets, "clone": clone}
-        return agent.update(state, batch, batch, **predicates)
+    def updated(state, data, *predicates):
+        return AGENT.update(state, *data, **dict(zip(names, predicates, strict=True)))
 
-    mapped = jax.vmap(update, in_axes=(0, 0, None, None, None))
+    mapped = jax.jit(jax.vmap(updated, in_axes=(0, 0, None, None, None)))
+    traced = mapped.trace(*stacked, *map(np.bool_, (True, True, True)))
+    assert str(traced.jaxpr).count("cond[") == 3
+    run = traced.lower().compile()
     for predicates in itertools.product((False, True), repeat=3):
-        traced, _ = jax.jit(mapped)(states, batches, *map(jnp.asarray, predicates))
-        static = jax.vmap(lambda *args, predicates=predicates: update(*args, *predicates))
-        known, _ = jax.jit(static)(states, batches)
-        chex.assert_trees_all_close(traced, known, rtol=1e-5, atol=1e-7)
-    jaxpr = jax.make_jaxpr(mapped)(states, batches, *map(jnp.asarray, predicates))
-    assert str(jaxpr).count("cond[") == 3
+        result, _ = run(*stacked, *map(np.bool_, predicates))
+        # Cloning is a part of the actor's update.
+        static = dict(zip(names, predicates, strict=True)) | {"clone": all(predicates[::2])}
+        known = [update(state, *data, **static)[0] for state, data in each]
+        known = jax.tree.map(lambda *leaves: np.stack(leaves), *known)
+        chex.assert_trees_all_close(result, known, rtol=1e-5, atol=1e-7)
 
 
 def test_without_cloning_the_demonstrations_change_nothing():
-    agent = plain_gradient_descent()
-    state = agent.init(jax.random.key(0))
-    batch, demonstrations = random_batch(jax.random.key(1), 8), random_batch(jax.random.key(2), 5)
-    chex.assert_trees_all_equal(
-        agent.update(state, batch, demonstrations, clone=False), agent.update(state, batch)
-    )
+    state, (batch, demonstrations) = initial(DDPGHParams(behaviour_cloning=0.7)), batches()
+    without = update(state, batch)
+    chex.assert_trees_all_equal(update(state, batch, demonstrations, clone=False), without)
 
 
 def test_one_vmapped_seed_gives_what_the_unbatched_update_gives():
-    agent = ddpg.make(SPEC)
-    state, batch = agent.init(jax.random.key(0)), random_batch(jax.random.key(1), 32)
-    alone, info = jax.jit(agent.update)(state, batch)
-    first = jax.tree.map(lambda leaf: leaf[None], (state, batch))
-    mapped, mapped_info = jax.jit(jax.vmap(agent.update))(*first)
+    state, (batch, _) = initial(), batches()
+    first = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (state, batch))
+    mapped = jax.jit(jax.vmap(AGENT.update))(*first)
     chex.assert_trees_all_close(
-        (alone, info),
-        jax.tree.map(lambda leaf: leaf[0], (mapped, mapped_info)),
+        update(state, batch),
+        jax.tree.map(lambda leaf: np.asarray(leaf)[0], mapped),
         rtol=1e-4,
         atol=1e-6,
     )
@@ -187,39 +183,33 @@ def test_one_vmapped_seed_gives_what_the_unbatched_update_gives():
 
 def test_hyperparameters_are_leaves():
     agent = ddpg.make(SPEC, networks=SMALL)
-    states = jax.vmap(agent.init)(jnp.stack([jax.random.key(0)] * 2))
-    rates = jnp.array([0.0, 1e-2])
+    key = jax.random.key(0)
+    states = jax.tree.map(lambda leaf: np.stack([leaf] * 2), agent.init(key, draw(key)))
+    rates = np.float32([0.0, 1e-2])
     states = states.replace(hparams=states.hparams.replace(critic_learning_rate=rates))
-    batch = random_batch(jax.random.key(1), 8)
-    after, _ = jax.jit(jax.vmap(agent.update, in_axes=(0, None)))(states, batch)
-    kernel = [state.critic["params"]["Dense_0"]["kernel"] for state in (states, after)]
-    change = jnp.abs(kernel[1] - kernel[0]).max((1, 2))
+    after, _ = jax.jit(jax.vmap(agent.update, in_axes=(0, None)))(states, batches()[0])
+    kernel = [np.asarray(state.critic["params"]["Dense_0"]["kernel"]) for state in (states, after)]
+    change = abs(kernel[1] - kernel[0]).max((1, 2))
     assert change[0] == 0.0
     assert change[1] > 1e-3
 
 
-def test_default_optimiser_is_adam_at_the_states_rate():
+def test_default_optimiser_is_adam_at_the_rate_of_a_donated_state():
     ours = ddpg.make(SPEC, networks=SMALL)
     theirs = ddpg.make(
         SPEC, networks=SMALL, actor_optimizer=optax.adam(1e-4), critic_optimizer=optax.adam(1e-3)
     )
-    updates = [jax.jit(agent.update) for agent in (ours, theirs)]
-    states = [agent.init(jax.random.key(0)) for agent in (ours, theirs)]
+    updates = [jax.jit(agent.update, donate_argnums=0) for agent in (ours, theirs)]
+    key = jax.random.key(0)
+    states = [agent.init(key, draw(key)) for agent in (ours, theirs)]
     for step in range(3):
-        batch = random_batch(jax.random.key(step), 8)
+        batch = random_batch(jax.random.key(step), 16)
         states = [update(state, batch)[0] for update, state in zip(updates, states, strict=True)]
+    # The second call does not compile again.
+    assert updates[0]._cache_size() == 1
     for name in ("actor", "critic"):
         first, second = (getattr(state, name) for state in states)
         chex.assert_trees_all_close(first, second, rtol=1e-5, atol=1e-7)
-
-
-def test_state_can_be_donated_and_a_second_call_does_not_recompile():
-    agent = ddpg.make(SPEC)
-    update = jax.jit(agent.update, donate_argnums=0)
-    state = agent.init(jax.random.key(0))
-    for step in range(2):
-        state, _ = update(state, random_batch(jax.random.key(step), 32))
-    assert update._cache_size() == 1
 
 
 def test_batch_normalised_networks_train_and_move_their_statistics():
@@ -228,13 +218,16 @@ def test_batch_normalised_networks_train_and_move_their_statistics():
     )
     hparams = DDPGHParams(behaviour_cloning=0.7)
     agent = ddpg.make(SPEC, hparams, networks=networks.make(SPEC, architecture))
-    before, batch = agent.init(jax.random.key(0)), random_batch(jax.random.key(1), 32)
-    after, _ = jax.jit(agent.update)(before, batch)
+    before, (batch, demonstrations) = jax.jit(agent.init)(jax.random.key(0)), batches()
+    update = jax.jit(agent.update)
+    after, _ = update(before, batch)
     for name in ("actor", "critic"):
-        old, new = (getattr(state, name)["batch_stats"] for state in (before, after))
-        assert all(jax.tree.leaves(jax.tree.map(lambda a, b: bool((a != b).any()), old, new)))
+        old, new = (
+            jax.device_get(getattr(state, name)["batch_stats"]) for state in (before, after)
+        )
+        assert all(jax.tree.leaves(jax.tree.map(lambda a, b: (a != b).any(), old, new)))
     # The behaviour-cloning term must not move running statistics.
-    cloned, _ = jax.jit(agent.update)(before, batch, random_batch(jax.random.key(2), 8))
+    cloned, _ = update(before, batch, demonstrations)
     chex.assert_trees_all_close(
         cloned.actor["batch_stats"], after.actor["batch_stats"], rtol=1e-5, atol=1e-7
     )
@@ -242,64 +235,68 @@ def test_batch_normalised_networks_train_and_move_their_statistics():
 
 @pytest.mark.parametrize("field", Transition._fields)
 def test_wrong_shapes_are_named(field):
-    agent = ddpg.make(SPEC, networks=SMALL)
-    batch = random_batch(jax.random.key(0), 8)
-    wrong = batch._replace(**{field: getattr(batch, field)[..., None]})
+    batch, _ = batches()
+    wrong = batch._replace(**{field: np.asarray(getattr(batch, field))[..., None]})
     with pytest.raises(ValueError, match="batch: expected leaves of shape"):
-        agent.update(agent.init(jax.random.key(0)), wrong)
+        AGENT.update(initial(), wrong)
     with pytest.raises(ValueError, match="demonstrations: expected leaves of shape"):
-        agent.update(agent.init(jax.random.key(0)), batch, wrong)
+        AGENT.update(initial(), batch, wrong)
 
 
-def train_on_probe(make_batch, hparams, steps=1500):
-    agent = ddpg.make(PROBE, hparams)
-
-    def step(state, key):
-        return agent.update(state, make_batch(key))[0], None
-
-    keys = jax.random.split(jax.random.key(1), steps)
-    state, _ = jax.jit(lambda state: jax.lax.scan(step, state, keys))(agent.init(jax.random.key(0)))
-    return agent, state
+OBSERVATIONS = np.float32([[-1.0], [0.0], [1.0]])
+ACTIONS = np.linspace(-1.0, 1.0, 9, dtype=np.float32)[:, None]
 
 
-def probe_batch(key, observation, reward, next_observation, terminated):
-    action = jax.random.uniform(key, (32, 1), minval=-1.0, maxval=1.0)
-    column = jnp.ones((32, 1))
-    return Transition(
-        observation=observation * column,
-        action=action,
-        reward=reward(action) * jnp.ones(32),
-        next_observation=next_observation * column,
-        terminated=jnp.broadcast_to(terminated, 32),
-    )
+@pytest.fixture(scope="module")
+def probes():
+    """Actions `[3]` and values `[3, 9]` learnt on each probe, from batches of two kinds of step."""
+    kinds = {
+        # observations, next ones, terminated, rewards, reward by action, discount, actor's rate
+        "one step": ([0, 0], [0, 0], [True, True], [0, 0], -1, 0.99, 1e-3),
+        "two steps": ([-1, 1], [1, 1], [False, True], [0, 1], 0, 0.6, 1e-4),
+        "time limit": ([0, 0], [0, 0], [False, False], [1, 1], 0, 0.5, 1e-4),
+        "end": ([0, 0], [0, 0], [True, True], [1, 1], 0, 0.5, 1e-4),
+    }
+    agent = ddpg.make(PROBE)
+
+    def train(observation, next_observation, terminated, reward, by_action, discount, rate):
+        def step(state, key):
+            action = jax.random.uniform(key, (32, 1), minval=-1.0, maxval=1.0)
+            rewards = jnp.repeat(reward, 16) + by_action * jnp.square(action[:, 0] - 0.3)
+            batch = Transition(
+                observation=jnp.repeat(observation, 16)[:, None],
+                action=action,
+                reward=rewards,
+                next_observation=jnp.repeat(next_observation, 16)[:, None],
+                terminated=jnp.repeat(terminated, 16),
+            )
+            return agent.update(state, batch)[0], None
+
+        state = agent.init(jax.random.key(0))
+        hparams = state.hparams.replace(discount=discount, actor_learning_rate=rate)
+        keys = jax.random.split(jax.random.key(1), 1500)
+        state, _ = jax.lax.scan(step, state.replace(hparams=hparams), keys)
+        pairs = jnp.broadcast_arrays(OBSERVATIONS[:, None], ACTIONS)
+        return agent.act(state, OBSERVATIONS)[:, 0], agent.value(state, *pairs)
+
+    columns = (np.array(column) for column in zip(*kinds.values(), strict=True))
+    numbers = [column if column.dtype == bool else np.float32(column) for column in columns]
+    trained = jax.jit(jax.vmap(train))(*numbers)
+    return dict(zip(kinds, zip(*jax.device_get(trained), strict=True), strict=True))
 
 
-def test_probe_one_step_whose_reward_depends_on_the_action():
-    agent, state = train_on_probe(
-        lambda key: probe_batch(key, 0.0, lambda a: -jnp.square(a[:, 0] - 0.3), 0.0, True),
-        DDPGHParams(actor_learning_rate=1e-3),
-    )
-    np.testing.assert_allclose(agent.act(state, jnp.zeros(1)), 0.3, atol=0.05)
-    actions = jnp.linspace(-1.0, 1.0, 9)[:, None]
-    values = agent.value(state, jnp.zeros((9, 1)), actions)
-    np.testing.assert_allclose(values, -((actions[:, 0] - 0.3) ** 2), atol=0.05)
+def test_probe_one_step_whose_reward_depends_on_the_action(probes):
+    actions, values = probes["one step"]
+    np.testing.assert_allclose(actions[1], 0.3, atol=0.05)
+    np.testing.assert_allclose(values[1], -((ACTIONS[:, 0] - 0.3) ** 2), atol=0.05)
 
 
-def test_probe_two_steps_where_the_discount_matters():
-    def batch(key):
-        first = probe_batch(key, -1.0, lambda a: jnp.zeros(32), 1.0, False)
-        second = probe_batch(key, 1.0, lambda a: jnp.ones(32), 1.0, True)
-        return jax.tree.map(lambda x, y: jnp.concatenate([x, y]), first, second)
-
-    agent, state = train_on_probe(batch, DDPGHParams(discount=0.6))
-    values = agent.value(state, jnp.array([[-1.0], [1.0]]), jnp.zeros((2, 1)))
-    np.testing.assert_allclose(values, [0.6, 1.0], atol=0.03)
+def test_probe_two_steps_where_the_discount_matters(probes):
+    _, values = probes["two steps"]
+    np.testing.assert_allclose(values[[0, 2], 4], [0.6, 1.0], atol=0.03)
 
 
-@pytest.mark.parametrize(("terminated", "value"), [(False, 2.0), (True, 1.0)])
-def test_probe_a_time_limit_bootstraps_and_an_end_does_not(terminated, value):
-    agent, state = train_on_probe(
-        lambda key: probe_batch(key, 0.0, lambda a: jnp.ones(32), 0.0, terminated),
-        DDPGHParams(discount=0.5),
-    )
-    np.testing.assert_allclose(agent.value(state, jnp.zeros(1), jnp.zeros(1)), value, atol=0.05)
+@pytest.mark.parametrize(("kind", "value"), [("time limit", 2.0), ("end", 1.0)])
+def test_probe_a_time_limit_bootstraps_and_an_end_does_not(probes, kind, value):
+    _, values = probes[kind]
+    np.testing.assert_allclose(values[1, 4], value, atol=0.05)

@@ -33,6 +33,12 @@ def of_actions(dims):
     return networks.make(spec, ARCHITECTURE)
 
 
+@functools.cache
+def drawn():
+    """The small networks' parameters."""
+    return jax.jit(lambda key: (SMALL.actor.init(key), SMALL.critic.init(key)))(jax.random.key(0))
+
+
 def reference_critic_loss(kind, critic, batch, returns, cells=5):
     grid = np.linspace(-1.0, 1.0, cells)
     losses = []
@@ -69,7 +75,11 @@ def test_critic_loss_and_gradient_equal_a_float64_reference(kind, dims):
     hparams = HotStartHParams(critic=kind, cells=5, margin=MARGIN)
     small = of_actions(dims)
     batch, returns = random_batch(jax.random.key(0), 6, small.spec), np.linspace(-10.0, 90.0, 6)
-    critic = small.critic.init(jax.random.key(1))
+    critic = jax.tree.map(
+        lambda leaf: np.random.default_rng(leaf.size).uniform(-0.5, 0.5, leaf.shape),
+        jax.eval_shape(small.critic.init, jax.random.key(1)),
+    )
+    critic = jax.tree.map(np.float32, critic)
 
     def loss(critic):
         return hot_start.critic_loss(
@@ -89,22 +99,22 @@ def test_critic_loss_and_gradient_equal_a_float64_reference(kind, dims):
 
 def test_softmaxes_along_the_dimensions_are_the_marginals_of_a_full_grid():
     made = of_actions(2)
-    weights = jnp.array([[1.5, -0.7], [-2.0, 0.4]])
+    weights = np.float32([[1.5, -0.7], [-2.0, 0.4]])
 
     def value(weights, observation, action):
-        q = jnp.sum(weights[0] * action + weights[1] * jnp.square(action), axis=-1)
+        q = (weights[0] * action + weights[1] * action**2).sum(axis=-1)
         return q + observation[..., 0]
 
     made = made._replace(critic=Network(lambda key: weights, value))
     hparams = HotStartHParams(critic="softmax")
-    demonstrated = jnp.array([[0.2, -1.0]])
-    loss, _ = hot_start.critic_loss(
-        made, weights, hparams, jnp.zeros((1, 2)), demonstrated, jnp.zeros(1)
+    demonstrated = np.float32([[0.2, -1.0]])
+    loss, _ = jax.jit(functools.partial(hot_start.critic_loss, made))(
+        weights, hparams, np.zeros((1, 2)), demonstrated, np.zeros(1)
     )
     # The loss of the marginals of the softmax over all 11 x 11 actions.
     axis = np.linspace(-1.0, 1.0, 11)
     actions = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-    full = scipy.special.softmax(value(np.asarray(weights), np.zeros(1), actions))
+    full = scipy.special.softmax(value(weights, np.zeros(1), actions))
     marginals = full.sum(axis=1), full.sum(axis=0)
     cells = np.eye(11)[6], np.eye(11)[0]
     expected = [np.sum((p - cell) ** 2) for p, cell in zip(marginals, cells, strict=True)]
@@ -142,25 +152,29 @@ def test_at_eight_dimensions_the_fitted_critic_prefers_the_demonstrated_action()
     made = of_actions(8)
     made = made._replace(critic=networks.critic(made.spec, Architecture(hidden=(16,))))
     pool = random_batch(jax.random.key(0), 200, made.spec)
-    weights = jax.random.normal(jax.random.key(5), (2, 8))
-    demonstrated = jnp.tanh(jnp.asarray(scaled(pool.observation), jnp.float32) @ weights)
+    rng = np.random.default_rng(5)
+    demonstrated = np.float32(np.tanh(scaled(pool.observation) @ rng.normal(size=(2, 8))))
     data = hot_start.HotStartData(
         pool._replace(action=demonstrated),
-        jnp.zeros(200),
-        demonstrations.DemonstrationSubset(jnp.array([0]), jnp.array([200])),
+        np.zeros(200, np.float32),
+        demonstrations.DemonstrationSubset(np.array([0]), np.array([200])),
     )
-    params = made.actor.init(jax.random.key(1)), made.critic.init(jax.random.key(2))
     hparams = HotStartHParams(steps=300, learning_rate=5e-3)
-    _, critic = jax.jit(functools.partial(hot_start.fit, networks=made, hparams=hparams))(
-        jax.random.key(3), params=params, demonstrations=data
-    )
-    best = made.critic.apply(critic, pool.observation, demonstrated)
-    others = jax.random.uniform(jax.random.key(4), (200, 8), minval=-1.0)
-    assert np.mean(best > made.critic.apply(critic, pool.observation, others)) > 0.95
+
+    @jax.jit
+    def fit(key):
+        params = made.actor.init(key), made.critic.init(key)
+        return hot_start.fit(key, made, params, data, hparams)[1]
+
+    value = jax.jit(functools.partial(made.critic.apply, fit(jax.random.key(3)), pool.observation))
+    best = np.asarray(value(demonstrated))
+    others = rng.uniform(-1.0, 1.0, (200, 8)).astype(np.float32)
+    assert np.mean(best > value(others)) > 0.95
     # One dimension is moved to the farther bound.
     for dimension in range(8):
-        far = demonstrated.at[:, dimension].set(-jnp.sign(demonstrated[:, dimension]))
-        assert np.mean(best > made.critic.apply(critic, pool.observation, far)) > 0.9
+        far = demonstrated.copy()
+        far[:, dimension] = -np.sign(demonstrated[:, dimension])
+        assert np.mean(best > value(far)) > 0.9
 
 
 def test_the_large_margin_is_a_hinge_on_how_far_the_demonstrated_action_leads():
@@ -171,11 +185,11 @@ def test_the_large_margin_is_a_hinge_on_how_far_the_demonstrated_action_leads():
 
     def loss(slope, margin):
         hparams = HotStartHParams(critic="large-margin", cells=3, margin=margin)
-        observation, action = jnp.zeros((2, 2)), jnp.array([[1.0], [0.9]])
-        return hot_start.critic_loss(made, slope, hparams, observation, action, jnp.zeros(2))[0]
+        observation, action = np.zeros((2, 2)), np.float32([[1.0], [0.9]])
+        return hot_start.critic_loss(made, slope, hparams, observation, action, np.zeros(2))[0]
 
     slopes, margins = np.meshgrid([0.0, 0.1, 0.5, 2.0], [0.0, 0.3, 0.8], indexing="ij")
-    losses = jax.vmap(loss)(jnp.asarray(slopes.ravel()), jnp.asarray(margins.ravel()))
+    losses = jax.jit(jax.vmap(loss))(np.float32(slopes.ravel()), np.float32(margins.ravel()))
     leads = slopes.ravel()[:, None] * [1.0, 0.9]
     expected = np.maximum(margins.ravel()[:, None] - leads, 0.0).mean(axis=1)
     np.testing.assert_allclose(losses, expected, atol=1e-6)
@@ -189,15 +203,15 @@ def test_action_cells_are_even_along_each_dimension_with_both_bounds(skewed_spec
 @pytest.fixture(scope="module")
 def fitted():
     pool = pools.scripted()
-    agent = ddpg.make(SPEC)
-    before = agent.init(jax.random.key(0))
+    agent = ddpg.make(SPEC, networks=networks.make(SPEC, Architecture(hidden=(32, 32))))
 
+    @jax.jit
     def fit(key, data):
-        params = (before.actor, before.critic)
-        hparams = HotStartHParams(critic="quadratic", learning_rate=5e-3, steps=2000)
+        params = agent.networks.actor.init(key), agent.networks.critic.init(key)
+        hparams = HotStartHParams(critic="quadratic", learning_rate=5e-3, steps=1200)
         return hot_start.fit(key, agent.networks, params, data, hparams)
 
-    params = jax.jit(fit)(jax.random.key(1), hot_start.data(pool, 0.99))
+    params = fit(jax.random.key(1), hot_start.data(pool, 0.99))
     return agent, pool, agent.init(jax.random.key(0), params), params
 
 
@@ -211,10 +225,11 @@ def test_the_fitted_actor_solves_the_task_it_was_shown(fitted):
 
 def test_the_quadratic_critic_comes_to_the_demonstrated_returns(fitted):
     agent, pool, state, _ = fitted
-    values = agent.value(state, pool.transition.observation, pool.transition.action)
+    value = jax.jit(agent.value)
+    values = value(state, pool.transition.observation, pool.transition.action)
     returns = demonstrations.discounted_returns(pool, 0.99)
     assert np.corrcoef(values, returns)[0, 1] > 0.7
-    far = agent.value(state, pool.transition.observation, -pool.transition.action)
+    far = value(state, pool.transition.observation, -pool.transition.action)
     # 20 (a_k - a_demo)^2 at a distance of 0.6.
     assert 4.0 < np.mean(np.asarray(values) - np.asarray(far)) < 10.0
 
@@ -240,15 +255,13 @@ def test_only_the_subset_is_read(kind):
         observation=np.where(outside[:, None], np.nan, pool.transition.observation)
     )
     data = hot_start.data(pool, 0.99)._replace(transition=poisoned)
-    params = SMALL.actor.init(jax.random.key(0)), SMALL.critic.init(jax.random.key(1))
     hparams = HotStartHParams(critic=kind, steps=50)
-    result = hot_start.fit(jax.random.key(2), SMALL, params, data, hparams, subset=own)
+    result = hot_start.fit(jax.random.key(2), SMALL, drawn(), data, hparams, subset=own)
     chex.assert_tree_all_finite(result)
 
 
 def test_a_pool_can_be_passed_as_it_is():
-    params = SMALL.actor.init(jax.random.key(0)), SMALL.critic.init(jax.random.key(1))
-    hparams = HotStartHParams(steps=3)
+    hparams, params = HotStartHParams(steps=3), drawn()
     pool = pools.scripted()
     direct = hot_start.fit(jax.random.key(2), SMALL, params, pool, hparams)
     prepared = hot_start.fit(jax.random.key(2), SMALL, params, hot_start.data(pool, 0.99), hparams)

@@ -39,8 +39,7 @@ REWARDS = Rewards(mixture, WEIGHTS)
 def test_distances_to_the_true_reward_are_those_of_the_known_relations():
     keys = jax.random.split(jax.random.key(0), len(WEIGHTS))
     draw = jax.vmap(lambda key: coverage_lib.uniform(key, ENV, 256, 64))
-    made = jax.jit(draw)(keys)
-    found = jax.jit(lambda: card.truth(REWARDS, ENV, made, DISCOUNT))()
+    found = jax.device_get(jax.jit(lambda: card.truth(REWARDS, ENV, draw(keys), DISCOUNT))())
     for distance in (found.epic, found.dard):
         np.testing.assert_allclose(distance[:3], [0.0, 1.0, 0.0], atol=2e-2)
         assert 0.6 < distance[3] < 0.8
@@ -50,21 +49,24 @@ def test_distances_to_the_true_reward_are_those_of_the_known_relations():
 
 def test_on_a_grid_the_optimums_advantage_correlates_with_itself():
     mdp = jax.jit(lambda: discretise.make(ENV, (21, 21), (5,)))()
-    found = jax.jit(lambda: card.on_grid(REWARDS, mdp, DISCOUNT))()
+    found = jax.device_get(jax.jit(lambda: card.on_grid(REWARDS, mdp, DISCOUNT))())
     np.testing.assert_allclose(found.starc[:2], [0.0, 1.0], atol=2e-2)
     # A constant of 3 a step makes never arriving the best that can be done.
     assert found.starc[2] > 0.9
     assert 0.6 < found.starc[3] < 0.8
 
-    best = value_iteration(mdp.dynamics, mdp.reward, discount=DISCOUNT, absorbing=mdp.absorbing)
-    advantage = best.action_values - best.values[:, None]
+    @jax.jit
+    def card_of_the_advantage():
+        best = value_iteration(mdp.dynamics, mdp.reward, discount=DISCOUNT, absorbing=mdp.absorbing)
+        advantage = best.action_values - best.values[:, None]
 
-    def looked_up(params, observation, action):
-        del observation, action
-        return params * advantage[:-1]
+        def looked_up(params, observation, action):
+            del observation, action
+            return params * advantage[:-1]
 
-    both = Rewards(looked_up, np.array([2.0, -1.0], np.float32))
-    found = card.on_grid(both, mdp, DISCOUNT)
+        return card.on_grid(Rewards(looked_up, np.float32([2.0, -1.0])), mdp, DISCOUNT)
+
+    found = jax.device_get(card_of_the_advantage())
     np.testing.assert_allclose(found.advantage, [1.0, -1.0], atol=1e-3)
     # A policy is ranked by its advantages: they are equivalent to the reward.
     assert found.starc[0] < 0.1
@@ -81,13 +83,12 @@ def steps(actions):
 
 def test_a_reward_that_pays_demonstrations_more_tells_them_apart():
     rewards = Rewards(lambda params, observation, action: params * action[..., 0], np.ones(1))
-    found = card.told(rewards, steps([1.0, 2.0, 3.0]), steps([0.0, 2.0, -1.0]))
+    shown, others = steps([1.0, 2.0, 3.0]), steps([0.0, 2.0, -1.0])
+    found = jax.jit(lambda: card.told(rewards, shown, others))()
     assert found.auc[0] == pytest.approx((2 + 2.5 + 3) / 9)
     assert (found.largest[0], found.smallest[0]) == (3.0, -1.0)
-    apart = card.occupancies(
-        jax.random.key(0), np.ones(3), steps([1.0, 2.0, 3.0]), steps([0.0, 2.0, -1.0])
-    )
-    same = card.occupancies(jax.random.key(0), np.ones(3), steps([1.0, 2.0]), steps([1.0, 2.0]))
+    compare = jax.jit(lambda *pairs: card.occupancies(jax.random.key(0), np.ones(3), *pairs))
+    apart, same = compare(shown, others), compare(shown, shown)
     assert apart.wasserstein[0] > 0.5
     assert same.wasserstein[0] == 0.0
 

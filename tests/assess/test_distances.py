@@ -113,7 +113,7 @@ def test_canonical_forms_are_those_of_the_definitions():
     made, reward = covered(0, n=7, k=5), random_reward(*numbers(3))
     with jax.enable_x64():
         slow = {"epic": slow_epic(reward, made), "dard": slow_dard(reward, made)}
-    for name, form in forms(reward, made).items():
+    for name, form in jax.jit(lambda: forms(reward, made))().items():
         np.testing.assert_allclose(form, slow[name], atol=2e-5)
 
 
@@ -136,6 +136,7 @@ def test_unrelated_rewards_are_far_from_each_other():
 
 
 starc = jax.jit(lambda dynamics, reward: distances.starc(dynamics, reward, DISCOUNT))
+normalised = jax.jit(distances.normalised)
 
 
 def starc_problem(seed):
@@ -150,9 +151,10 @@ def test_starc_is_blind_to_what_changes_no_policys_rank(seed, scale, constant):
     dynamics, reward = starc_problem(seed)
     potential = np.random.default_rng(seed + 1).normal(size=6)
     other = scale * reward + constant + DISCOUNT * dynamics @ potential - potential[:, None]
-    ours, theirs, opposite = starc(dynamics, np.float32([reward, other, -other]))
-    assert distances.normalised(ours, theirs) < 5e-3
-    assert distances.normalised(ours, opposite) > 1 - 1e-3
+    rewards = np.float32([reward, other, -other])
+    ours, theirs, opposite = np.asarray(starc(dynamics, rewards))
+    assert normalised(ours, theirs) < 5e-3
+    assert normalised(ours, opposite) > 1 - 1e-3
 
 
 def test_starc_is_that_of_a_sum_over_the_policys_future():
@@ -160,23 +162,27 @@ def test_starc_is_that_of_a_sum_over_the_policys_future():
     go_on, paid = dynamics.astype(np.float64).mean(axis=1), reward.astype(np.float64).mean(axis=1)
     values = sum(DISCOUNT**t * np.linalg.matrix_power(go_on, t) @ paid for t in range(400))
     slow = reward - values[:, None] + DISCOUNT * dynamics @ values
-    np.testing.assert_allclose(distances.starc(dynamics, reward, DISCOUNT), slow, atol=1e-5)
+    np.testing.assert_allclose(starc(dynamics, reward), slow, atol=1e-5)
     # Several rewards at once, and sparse dynamics.
-    both = distances.starc(mdps.sparse(dynamics), jnp.stack([reward, 2 * reward]), DISCOUNT)
+    both = starc(mdps.sparse(dynamics), np.stack([reward, 2 * reward]))
     np.testing.assert_allclose(both, [slow, 2 * slow], atol=1e-5)
 
 
 def test_uniform_coverage_lies_within_the_bounds_and_follows_the_task():
     env = pools.ENV
-    made = coverage_lib.uniform(jax.random.key(0), env, 50, 20)
+    step = coverage_lib.successor(env)
+
+    @jax.jit
+    def cover(key):
+        made = coverage_lib.uniform(key, env, 50, 20)
+        return made, jax.vmap(step)(made.observation, made.action)
+
+    made, following = jax.device_get(cover(jax.random.key(0)))
     spec = env.spec
     for leaf in (made.observation, made.observations, made.next_observations):
         assert np.all((leaf >= spec.observation_low) & (leaf <= spec.observation_high))
     assert np.abs(made.actions).max() > 0.8
-    step = coverage_lib.successor(env)
-    np.testing.assert_array_equal(
-        jax.vmap(step)(made.observation, made.action), made.next_observation
-    )
+    np.testing.assert_array_equal(following, made.next_observation)
     # Bounds as large as floats are say nothing, although they are finite.
     largest = np.full(2, np.finfo(np.float32).max)
     boundless = spec._replace(observation_low=-largest, observation_high=largest)
@@ -188,7 +194,8 @@ def test_uniform_coverage_lies_within_the_bounds_and_follows_the_task():
 
 def test_visited_coverage_is_of_the_steps_that_were_made():
     transition = pools.scripted(3).transition
-    made = coverage_lib.visited(jax.random.key(0), transition, 30, 10)
+    draw = jax.jit(lambda key: coverage_lib.visited(key, transition, 30, 10))
+    made = draw(jax.random.key(0))
     rows = {tuple(row) for row in np.hstack([transition.observation, transition.action])}
     assert all(tuple(row) in rows for row in np.hstack([made.observation, made.action]))
     assert [leaf.shape for leaf in made[3:]] == [(10, 1), (10, 2), (10, 2)]

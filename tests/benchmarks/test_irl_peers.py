@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import gail_ours, gridworlds, irl_ours, irl_peers, peers
 from cmedirl_jax.data import demonstrations
-from tests.support import mdps, pools
+from tests.support import mdps, pools, trainers
 
 SIDE, HORIZON = 3, 6
 
@@ -72,6 +72,8 @@ def test_where_episodes_end_lists_of_successors_change_nothing(problem):
 
 def test_our_gail_answers_with_a_return_for_each_seed(tmp_path, monkeypatch):
     demonstrations.save(tmp_path / "pool.npz", pools.scripted(2))
+    small = {"architecture": {"hidden": (4,)}, "reward_network": {"hidden": (4,)}}
+    monkeypatch.setattr(gail_ours, "ALIKE", trainers.with_(gail_ours.ALIKE, **small))
     advances = []
     monkeypatch.setattr(gail_ours, "serve_from_command_line", advances.append)
     monkeypatch.setattr("sys.argv", ["gail_ours", str(tmp_path / "pool.npz"), "2", "8"])

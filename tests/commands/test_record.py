@@ -1,5 +1,7 @@
 """Demonstrations of a run or of a function, recorded on the command line."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -7,10 +9,21 @@ from cmedirl_jax.commands import demonstrators
 from cmedirl_jax.commands.cmedirl import main
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.runs import load_policy
+from cmedirl_jax.runs.cells import scale
 from cmedirl_jax.runs.errors import UserError
 from tests.support import pools
 
 CAR = ["--env", pools.ENV.spec.id]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def random_actions_once():
+    """What random actions return on the car takes a second to measure."""
+    measure = scale.random_return
+    known = functools.cache(lambda starts: measure(pools.ENV, starts))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scale, "random_return", lambda env, starts: known(starts))
+        yield
 
 
 def push(observation):

@@ -20,7 +20,8 @@ from tests.support import ROOT
 DEMOS = ("--env", "Pendulum-v1", "--demos", "mine/pendulum/energy-v0")
 SMALL = (
     *("--seeds", "2", "--max-steps", "240", "--evaluation-starts", "2", "--devices", "1"),
-    *("--architecture.hidden", "16", "16", "--evaluate-every", "120", "--hot-start.steps", "20"),
+    *("--architecture.hidden", "16", "--reward-network.hidden", "8", "--hot-start.steps", "20"),
+    *("--architecture.critic-normalisation", "none", "--evaluate-every", "120"),
 )
 PICTURES = ("slices", "agreement", "retraining")
 """Of a task of three observations, which has no map."""

@@ -27,11 +27,11 @@ def test_episodes_are_where_the_pool_has_them(lengths):
 @given(n=st.integers(1, 8), padding=st.integers(0, 7), seed=st.integers(0, 2**32 - 1))
 def test_a_subset_is_n_different_episodes_and_padding(n, padding, seed):
     key, size = jax.random.key(seed), min(n + padding, 8)
-    padded = subset_of_eight(key, n, size)
+    padded = jax.device_get(subset_of_eight(key, n, size))
     assert padded.start.shape == padded.length.shape == (size,)
-    assert len(set(np.asarray(padded.start[:n]))) == n
+    assert len(set(padded.start[:n])) == n
     pairs = set(zip(*EPISODES, strict=True))
-    assert set(zip(*(np.asarray(field[:n]) for field in padded), strict=True)) <= pairs
+    assert set(zip(*(field[:n] for field in padded), strict=True)) <= pairs
     assert not padded.length[n:].any()
     for field, unpadded in zip(padded, subset_of_eight(key, n, n), strict=True):
         np.testing.assert_array_equal(field[:n], unpadded)
@@ -85,7 +85,7 @@ SUBSET = DemonstrationSubset(np.array([4, 8, 10, 0]), np.array([4, 0, 6, 0]))
 
 
 def test_sampling_is_uniform_over_the_steps_of_a_subset():
-    index = demonstrations.sample_index(KEY, SUBSET, 10_000)
+    index = jax.jit(lambda key: demonstrations.sample_index(key, SUBSET, 10_000))(KEY)
     steps, counts = np.unique(index, return_counts=True)
     np.testing.assert_array_equal(steps, [4, 5, 6, 7, 10, 11, 12, 13, 14, 15])
     assert scipy.stats.chisquare(counts).pvalue > 1e-3
@@ -140,7 +140,8 @@ def test_negative_sample_sizes_are_refused():
 
 def test_a_sample_is_whole_transitions_of_the_pool():
     pool = pools.random_pool([3, 1, 4, 2, 6, 5, 1, 2]).transition
-    batch = jax.device_get(demonstrations.sample(KEY, pool, SUBSET, 50))
+    sample = jax.jit(lambda key: demonstrations.sample(key, pool, SUBSET, 50))
+    batch = jax.device_get(sample(KEY))
     step = np.argmax(batch.reward[:, None] == pool.reward, axis=1)
     assert set(step) <= {4, 5, 6, 7, 10, 11, 12, 13, 14, 15}
     chex.assert_trees_all_equal(batch, demonstrations.at(pool, step))

@@ -28,6 +28,16 @@ def jitted(capacity):
     return buffer._replace(add=jax.jit(buffer.add), sample=sample)
 
 
+@jax.jit
+def packed(original):
+    """Rows, and what they unpack to."""
+    rows = replay.pack(SPEC, original)
+    return rows, replay.unpack(SPEC, rows)
+
+
+unpack = jax.jit(lambda row: replay.unpack(SPEC, row))
+
+
 def transition(number):
     """A transition that carries its number in every leaf."""
     number = np.float32(number)
@@ -63,7 +73,7 @@ def test_storage_holds_the_latest_transitions(capacity, count):
     oldest = count % capacity if count > capacity else 0
     rows = np.roll(np.asarray(state.storage), -oldest, axis=0)
     for row, expected in zip(rows, model, strict=False):
-        assert_equal(replay.unpack(SPEC, row), expected)
+        assert_equal(unpack(row), expected)
     assert not rows[len(model) :].any()
 
 
@@ -74,9 +84,9 @@ def test_storage_holds_the_latest_transitions(capacity, count):
 )
 def test_samples_are_the_transitions_of_the_recent_window(capacity, count, recent):
     buffer = jitted(capacity)
-    batch = buffer.sample(KEY, filled(buffer, count), 100, recent)
+    batch = jax.device_get(buffer.sample(KEY, filled(buffer, count), 100, recent))
     size = min(count, capacity, recent or capacity)
-    assert set(np.asarray(batch.reward)) == set(range(count - size, count))
+    assert set(batch.reward) == set(range(count - size, count))
     assert_equal(batch, stacked(batch.reward))
 
 
@@ -101,9 +111,8 @@ def transitions(leading):
 
 @given(st.sampled_from([(), (3,), (2, 4)]).flatmap(transitions))
 def test_unpack_inverts_pack(original):
-    rows = replay.pack(SPEC, original)
+    rows, unpacked = packed(original)
     assert rows.shape == (*original.reward.shape, replay.row_size(SPEC))
-    unpacked = replay.unpack(SPEC, rows)
     assert_equal(unpacked, original)
     assert unpacked.terminated.dtype == jnp.bool_
 
@@ -112,24 +121,29 @@ def test_vmapped_buffers_do_not_mix():
     buffer = replay.make(SPEC, 4)
     offsets = np.array([0, 100, 200])
     add = jax.jit(jax.vmap(buffer.add))
-    states = jax.vmap(lambda _: buffer.init())(offsets)
+    states = jax.jit(jax.vmap(lambda _: buffer.init()))(offsets)
     for number in range(6):
         states = add(states, stacked(offsets + number))
     keys = jax.random.split(KEY, 3)
-    batch = jax.vmap(buffer.sample, in_axes=(0, 0, None))(keys, states, 100)
+    batch = jax.jit(jax.vmap(lambda key, state: buffer.sample(key, state, 100)))(keys, states)
     for offset, rewards in zip(offsets, np.asarray(batch.reward), strict=True):
         assert set(rewards) == set(range(offset + 2, offset + 6))
 
 
 def test_sample_is_take_of_draw():
     buffer = replay.make(SPEC, 5)
-    state = filled(jitted(5), 8)
-    assert_equal(buffer.sample(KEY, state, 16, 3), buffer.take(state, buffer.draw(KEY, 16), 3))
+
+    @jax.jit
+    def both(key, state):
+        taken = buffer.take(state, buffer.draw(key, 16), 3)
+        return buffer.sample(key, state, 16, 3), taken
+
+    assert_equal(*both(KEY, filled(jitted(5), 8)))
 
 
 def test_an_empty_buffer_gives_zeros():
-    buffer = replay.make(SPEC, 3)
-    batch = buffer.sample(KEY, buffer.init(), 4)
+    buffer = jitted(3)
+    batch = jax.device_get(buffer.sample(KEY, buffer.init(), 4, None))
     assert batch.terminated.dtype == jnp.bool_
     assert_equal(batch, jax.tree.map(np.zeros_like, batch))
 
@@ -167,8 +181,8 @@ def test_impossible_samples_are_refused():
 
 
 def test_a_batch_of_size_zero_is_empty():
-    buffer = replay.make(SPEC, 3)
-    assert buffer.sample(KEY, buffer.init(), 0).observation.shape == (0, 2)
+    buffer = jitted(3)
+    assert buffer.sample(KEY, buffer.init(), 0, None).observation.shape == (0, 2)
 
 
 def test_other_values_do_not_recompile():

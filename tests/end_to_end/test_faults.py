@@ -73,8 +73,8 @@ class Runs:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory, compiled):
-    return Runs(tmp_path_factory.mktemp("runs"), os.environ | compiled)
+def runs(tmp_path_factory, unoptimised):
+    return Runs(tmp_path_factory.mktemp("runs"), os.environ | unoptimised)
 
 
 @pytest.fixture(scope="module")

@@ -90,8 +90,12 @@ def test_the_specification_is_of_unbounded_observations():
 def test_an_agent_trains_on_it_with_statistics_of_its_observations():
     env = envs.from_brax(Walk(), max_episode_steps=20)
     trainer = training.make(env, METHODS["ddpg"], trainers.SMALL, capacity=80)
-    state = trainer.init(KEY, None, 0)
-    state, _ = jax.jit(trainer.run)(state, None, jnp.arange(80, dtype=jnp.int32))
+
+    @jax.jit
+    def train(key):
+        return trainer.run(trainer.init(key, None, 0), None, jnp.arange(80, dtype=jnp.int32))
+
+    state, _ = train(KEY)
     assert int(state.episode) >= 4
     # The first observation, one a step, and the first ones of four more episodes.
     assert float(state.observation_statistics.count) == 85

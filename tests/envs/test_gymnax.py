@@ -105,7 +105,8 @@ def test_parameters_are_traced_and_can_be_given():
         params = env.default_params.replace(push=push)
         return env.step(KEY, state, jnp.ones(1), params)[1].observation[0] - before[0]
 
-    np.testing.assert_allclose(jax.vmap(moved)(jnp.array([0.1, 0.4])), [0.1, 0.4], rtol=1e-5)
+    pushes = np.float32([0.1, 0.4])
+    np.testing.assert_allclose(jax.jit(jax.vmap(moved))(pushes), pushes, rtol=1e-5)
 
 
 def test_starts_are_fixed():
@@ -118,8 +119,12 @@ def test_starts_are_fixed():
 def test_an_agent_trains_on_it():
     env = envs.from_gymnax(Walk())
     trainer = training.make(env, METHODS["ddpg"], trainers.SMALL, capacity=80)
-    state = trainer.init(KEY, None, 0)
-    state, log = jax.jit(trainer.run)(state, None, jnp.arange(80, dtype=jnp.int32))
+
+    @jax.jit
+    def train(key):
+        return trainer.run(trainer.init(key, None, 0), None, jnp.arange(80, dtype=jnp.int32))
+
+    state, log = jax.device_get(train(KEY))
     assert int(state.episode) >= 2
     np.testing.assert_allclose(log.episode_return[log.done], -0.5 * log.episode_length[log.done])
 

@@ -20,8 +20,6 @@ KEY = jax.random.key(0)
 step = jit_as_users(ENV.step)
 step_many = jit_as_users(jax.vmap(ENV.step, in_axes=(None, 0, 0, None)))
 
-pytestmark = pytest.mark.optimised
-
 
 @pytest.fixture(scope="module")
 def car():
@@ -48,10 +46,11 @@ def state_action_grid():
     return np.stack(grid, axis=-1).reshape(-1, 3).astype(np.float32)
 
 
+@pytest.mark.optimised
 def test_step_matches_gymnasium_on_a_grid(car):
     grid = state_action_grid()
-    states = MountainCarState(grid[:, 0], grid[:, 1], jnp.zeros(len(grid), jnp.int32))
-    _, result = step_many(KEY, states, grid[:, 2:], PARAMS)
+    states = MountainCarState(grid[:, 0], grid[:, 1], np.zeros(len(grid), np.int32))
+    result = jax.device_get(step_many(KEY, states, grid[:, 2:], PARAMS)[1])
     expected = np.array([gymnasium_step(car, *row) for row in grid])
 
     np.testing.assert_allclose(result.observation, expected[:, :2], rtol=0, atol=1e-6)
@@ -73,6 +72,7 @@ def test_the_grid_reaches_both_walls_the_speed_limits_and_the_goal(car):
     assert (terminated == 1).sum() > 100
 
 
+@pytest.mark.optimised
 def test_the_cost_is_of_the_action_given_and_the_force_of_the_clipped_one():
     _, beyond = step(KEY, state(-0.5, 0.0), jnp.array([3.0]), PARAMS)
     _, at_bound = step(KEY, state(-0.5, 0.0), jnp.array([1.0]), PARAMS)
@@ -80,6 +80,7 @@ def test_the_cost_is_of_the_action_given_and_the_force_of_the_clipped_one():
     np.testing.assert_allclose(beyond.reward, -0.9, rtol=1e-6)
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     ("position", "velocity", "terminated"),
     [
@@ -127,6 +128,7 @@ def episode(start, actions):
     return jax.lax.scan(advance, state(start, 0.0), actions)[1]
 
 
+@pytest.mark.optimised
 def test_noisy_episodes_match_gymnasium(car):
     rng = np.random.default_rng(0)
     starts = rng.uniform(-0.6, -0.4, 200).astype(np.float32)
@@ -148,6 +150,7 @@ def test_noisy_episodes_match_gymnasium(car):
     np.testing.assert_allclose(episode_return, expected_return, rtol=0, atol=1e-4)
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     ("position", "time", "terminated", "truncated"),
     [(-0.5, 997, 0, 0), (-0.5, 998, 0, 1), (0.5, 997, 1, 0), (0.5, 998, 1, 1)],
@@ -159,9 +162,8 @@ def test_the_time_limit_truncates_and_the_goal_terminates(position, time, termin
 
 
 def test_reset_rests_somewhere_in_the_start_interval():
-    states, observations = jax.vmap(ENV.reset, in_axes=(0, None))(
-        jax.random.split(KEY, 1000), PARAMS
-    )
+    reset = jax.jit(jax.vmap(ENV.reset, in_axes=(0, None)))
+    states, observations = jax.device_get(reset(jax.random.split(KEY, 1000), PARAMS))
     np.testing.assert_array_equal(
         observations, np.stack([states.position, states.velocity], axis=-1)
     )
@@ -183,9 +185,10 @@ def test_starts_are_the_midpoints_of_equal_parts_and_at_rest():
 def test_physics_can_be_vmapped_over(car, monkeypatch):
     powers = np.array([0.0005, 0.0015, 0.003], np.float32)
     axes = jax.tree.map(lambda _: None, PARAMS).replace(power=0)
-    _, result = jax.vmap(ENV.step, in_axes=(None, None, None, axes))(
+    _, result = jax.jit(jax.vmap(ENV.step, in_axes=(None, None, None, axes)))(
         KEY, state(-0.5, 0.01), jnp.array([0.7]), PARAMS.replace(power=powers)
     )
+    result = jax.device_get(result)
     assert len(np.unique(result.observation[:, 1])) == len(powers)
     for power, observation in zip(powers, result.observation, strict=True):
         monkeypatch.setattr(car, "power", float(power))
@@ -198,7 +201,7 @@ def test_velocity_is_differentiable_in_the_power():
         params = PARAMS.replace(power=power)
         return ENV.step(KEY, state(-0.5, 0.01), jnp.array([0.7]), params)[0].velocity
 
-    np.testing.assert_allclose(jax.grad(velocity)(0.0015), 0.7, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.grad(velocity))(0.0015), 0.7, rtol=1e-6)
 
 
 def in_bounds(index):
@@ -206,6 +209,7 @@ def in_bounds(index):
     return st.floats(float(low), float(high), width=32)
 
 
+@pytest.mark.optimised
 @given(
     position=in_bounds(0),
     velocity=in_bounds(1),
@@ -224,13 +228,15 @@ def test_other_values_do_not_recompile():
     jitted(jax.random.key(1), state(0.2, 0.05, 7), jnp.array([-0.4]), PARAMS.replace(power=0.002))
 
 
+@pytest.mark.optimised
 def test_a_batch_of_one_equals_no_batch():
     single = step(KEY, state(-0.7, 0.02, 3), jnp.array([0.3]), PARAMS)
-    batch = jax.tree.map(lambda x: x[None], state(-0.7, 0.02, 3))
+    batch = jax.tree.map(lambda x: np.asarray(x)[None], state(-0.7, 0.02, 3))
     batched = step_many(KEY, batch, jnp.array([[0.3]]), PARAMS)
-    chex.assert_trees_all_equal(single, jax.tree.map(lambda leaf: leaf[0], batched))
+    chex.assert_trees_all_equal(single, jax.tree.map(lambda leaf: np.asarray(leaf)[0], batched))
 
 
+@pytest.mark.optimised
 def test_step_keeps_shapes_and_dtypes():
     before = state(-0.5, 0.0)
     after, result = step(KEY, before, jnp.zeros(1), PARAMS)

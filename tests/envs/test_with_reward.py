@@ -17,16 +17,18 @@ def reward(params, observation, action):
 def test_the_reward_is_of_the_state_before_and_the_action_within_its_bounds():
     paying = envs.with_reward(ENV, reward, jnp.float32(2.0))
     envs.check(paying, steps=50)
+    added = envs.with_reward(ENV, reward, jnp.float32(2.0), mode="add")
+    pay, add, step_alone = (jax.jit(env.step) for env in (paying, added, ENV))
     state, observation = paying.reset(jax.random.key(0), paying.default_params)
     params = paying.default_params._replace(reward=jnp.float32(3.0))
     for force in (0.5, 7.0):
-        action = jnp.array([force], jnp.float32)
-        after, step = paying.step(jax.random.key(1), state, action, params)
-        own = ENV.step(jax.random.key(1), state.env, action, ENV.default_params)[1]
-        np.testing.assert_allclose(step.reward, 3.0 * (observation[0] + min(force, 1.0)))
+        action = np.float32([force])
+        after, step = pay(jax.random.key(1), state, action, params)
+        own = step_alone(jax.random.key(1), state.env, action, ENV.default_params)[1]
+        position = np.asarray(observation)[0]
+        np.testing.assert_allclose(step.reward, 3.0 * (position + min(force, 1.0)))
         np.testing.assert_array_equal(step.observation, own.observation)
-        added = envs.with_reward(ENV, reward, jnp.float32(2.0), mode="add")
-        both = added.step(jax.random.key(1), state, action, params)[1].reward
+        both = add(jax.random.key(1), state, action, params)[1].reward
         np.testing.assert_allclose(both, step.reward + own.reward, rtol=1e-6)
         state, observation = after, step.observation
 

@@ -12,8 +12,9 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-from cmedirl_jax.runs import load_policy, load_reward, validation
+from cmedirl_jax.runs import load_policy, load_reward, start, validation
 from cmedirl_jax.runs.cells import cell as cell_lib
+from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.training import tasks
@@ -23,7 +24,8 @@ TASK = "tests.support.host_tasks:Dock-v0"
 SMALL = [
     *("--env", TASK, "--preset", "smoke", "--seeds", "3", "--max-steps", "240"),
     *("--evaluate-every", "120", "--evaluation-starts", "2", "--experts.steps", "600"),
-    *("--architecture.hidden", "16", "16", "--experts.trajectories", "5", "--devices", "1"),
+    *("--architecture.hidden", "16", "--reward-network.hidden", "8"),
+    *("--experts.trajectories", "5", "--devices", "1"),
 ]
 METHODS = ["--methods", "ddpg", "hs-me-ddpg"]
 
@@ -36,11 +38,38 @@ def few_fresh_starts():
         yield
 
 
+def test_a_further_device_is_for_more_learners_on_the_host_than_in_jax(monkeypatch):
+    fewest = []
+
+    def refuse(*arguments):
+        fewest.append(arguments[-1])
+        raise UserError("enough")
+
+    monkeypatch.setattr(start, "start", refuse)
+    for env in ("Pendulum-v1", "gymnasium:Pendulum-v1"):
+        assert run_grid.main(["--env", env]) == 2
+    assert fewest == [4, 32]
+
+
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def programs():
+    """The compilers of `run`, which later runs of the same sizes need not make again."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, programs):
     folder = tmp_path_factory.mktemp("runs") / "dock"
-    with contextlib.redirect_stdout(io.StringIO()) as said:
-        assert run_grid.main([*SMALL, *METHODS, "--out", str(folder)]) == 0
+    compiler = compiled_lib.compiler
+
+    def remembered(*arguments, **options):
+        programs.append(compiler(*arguments, **options))
+        return programs[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiled_lib, "compiler", remembered)
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            assert run_grid.main([*SMALL, *METHODS, "--out", str(folder)]) == 0
     (folder.parent / "said.txt").write_text(said.getvalue())
     return folder
 
@@ -67,9 +96,12 @@ def test_its_scale_is_measured_on_its_own_starts(run):
     assert pooled.load(run).threshold == scale["solved"]
 
 
-def test_a_run_that_was_cut_off_goes_on_at_the_start_of_an_episode(tmp_path, monkeypatch, capsys):
+def test_a_run_that_was_cut_off_goes_on_at_the_start_of_an_episode(
+    run, programs, tmp_path, monkeypatch, capsys
+):
     """At step 90 of 240, within the second episode of 60 steps."""
     monkeypatch.setattr(cell_lib, "CHUNK", 90)
+    monkeypatch.setattr(compiled_lib, "compiler", lambda *_, **__: programs[0])
     folder, advance = tmp_path / "run", cell_lib._Training.advance
 
     def killed(training, stop):
@@ -78,6 +110,7 @@ def test_a_run_that_was_cut_off_goes_on_at_the_start_of_an_episode(tmp_path, mon
         advance(training, stop)
 
     command = [*SMALL, "--methods", "ddpg", "--checkpoint-every", "0", "--out", str(folder)]
+    command += ["--demos", str(run / "demonstrations" / "pool.npz")]
     with monkeypatch.context() as patch:
         patch.setattr(cell_lib._Training, "advance", killed)
         assert run_grid.main(command) == 130

@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 
 from cmedirl_jax.runs import load_policy
+from cmedirl_jax.runs.cells import cell as cell_lib
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import folder as run_folder
 from cmedirl_jax.training import tasks
@@ -14,7 +15,7 @@ from experiments import pooled, presets, run_grid
 
 SMALL = [
     *("--preset", "smoke", "--seeds", "4", "--max-steps", "300", "--evaluate-every", "150"),
-    *("--experts.steps", "1500", "--architecture.hidden", "16", "16"),
+    *("--experts.steps", "1500", "--architecture.hidden", "16", "--reward-network.hidden", "8"),
     *("--experts.trajectories", "5", "--devices", "1"),
 ]
 
@@ -23,8 +24,13 @@ SMALL = [
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "point"
     methods = ["--methods", "ddpg", "hs-me-ddpg"]
-    assert run_grid.main(["--env", "PointMass-v0", *SMALL, *methods, "--out", str(folder)]) == 0
-    return folder
+    # Experts who train as the learners do, in chunks of that size, share their program.
+    settings = run_grid.parse(["--env", "PointMass-v0", *SMALL]).settings
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cell_lib, "CHUNK", 150)
+        patch.setitem(tasks.TASKS, "PointMass-v0", tasks.TaskSettings(experts=settings))
+        assert run_grid.main(["--env", "PointMass-v0", *SMALL, *methods, "--out", str(folder)]) == 0
+        yield folder
 
 
 def test_solved_is_on_the_way_from_random_actions_to_the_best_expert(run):

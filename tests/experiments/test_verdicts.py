@@ -2,7 +2,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from cmedirl_jax.runs import statistics
+from cmedirl_jax.runs import intervals, paired, statistics
 from experiments import verdicts
 from experiments.measures import DIPS
 from experiments.pooled import CellSeeds, Pooled
@@ -10,6 +10,13 @@ from experiments.pooled import CellSeeds, Pooled
 SEEDS = 160
 EVERY = 250
 MOST = 50 * EVERY
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch):
+    """Cells that differ do so clearly: no verdict hangs on the last digit of a p-value."""
+    monkeypatch.setattr(paired, "FLIPS", 1_999)
+    monkeypatch.setattr(intervals, "RESAMPLES", 500)
 
 
 def cell(

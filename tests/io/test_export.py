@@ -1,5 +1,6 @@
 """What is exported is read without this library, and computes the same."""
 
+import functools
 import json
 import subprocess
 import sys
@@ -32,15 +33,20 @@ SETTINGS = {
 
 def moved(params):
     """Parameters that are no longer those of a start, where all outputs are small."""
-    key = jax.random.key(1)
-    return jax.tree.map(lambda x: x + 0.1 * jax.random.normal(key, x.shape), params)
+    rng = np.random.default_rng(1)
+    return jax.tree.map(lambda x: np.asarray(x) + rng.normal(0.0, 0.1, x.shape).astype("f"), params)
 
 
+@functools.cache
+def drawn_actor(architecture):
+    return jax.jit(networks.make(SPEC, architecture).actor.init)(jax.random.key(0))
+
+
+@functools.cache
 def functions(method, settings):
     made = compose.compose(SPEC, METHODS[method], settings, 10)
     state = made.learner.init(jax.random.key(0))
     inputs = {"observation": SPEC.observation_dim, "action": SPEC.action_dim}
-    actor = made.agent.networks.actor.init(jax.random.key(0))
     return {
         "reward": Function(
             lambda params, *pair: made.learner.reward(state.replace(params=params), *pair),
@@ -50,7 +56,7 @@ def functions(method, settings):
         ),
         "policy": Function(
             lambda params, observation: networks.policy(made.agent.networks, params, observation),
-            moved(actor),
+            moved(drawn_actor(settings.architecture)),
             {"observation": SPEC.observation_dim},
         ),
     }

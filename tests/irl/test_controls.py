@@ -54,24 +54,24 @@ def test_its_mean_and_deviation_are_those_of_the_network_over_the_bounds(skewed_
         network = Network(
             lambda key: (), lambda params, *inputs, coordinate=coordinate: coordinate(*inputs)
         )
-        _, mean, deviation = controls.random(skewed_spec, network=network).init(KEY).params
+        _, mean, deviation = jax.jit(controls.random(skewed_spec, network=network).init)(KEY).params
         wide = high - low
         np.testing.assert_allclose(mean, 0.5 * (low + high), atol=0.05 * wide)
         np.testing.assert_allclose(deviation, wide / np.sqrt(12), rtol=0.1)
 
 
 def test_the_bound_squashes_the_standardised_network():
-    reward = BOUNDED.reward(BOUNDED.init(KEY), *PAIRS)
+    reward = jax.jit(lambda key: BOUNDED.reward(BOUNDED.init(key), *PAIRS))(KEY)
     np.testing.assert_allclose(reward, 0.2 * np.tanh(standardised(init(KEY), *PAIRS)), atol=1e-5)
     assert np.std(reward) > 0.1
 
 
 @pytest.mark.parametrize("control", [controls.constant(0.1), OF_ONE], ids=["constant", "random"])
 def test_updates_learn_nothing(control):
-    before, batch = control.init(KEY), random_batch(KEY, 5)
+    before, batch = jax.jit(control.init)(KEY), random_batch(KEY, 5)
     after, info = control.update(before, batch, batch, key=KEY)
     chex.assert_trees_all_equal(after, before)
-    assert not np.any(info)
+    assert not np.any(jax.device_get(info))
 
 
 def test_each_seed_has_its_own_random_reward():
@@ -90,17 +90,15 @@ def test_each_seed_has_its_own_random_reward():
 def test_observations_without_bounds_are_probed_as_their_statistics_make_them():
     spec = SPEC._replace(observation_low=np.float32([-np.inf, -0.07]))
     learner = controls.random(spec)
-    state = learner.init(jax.random.key(0))
-    keys = jax.random.split(jax.random.key(1), 3)
-    observation = jnp.stack(
-        [
-            jax.random.normal(keys[0], (4_000,)),
-            jax.random.uniform(keys[1], (4_000,), minval=-0.07, maxval=0.07),
-        ],
-        axis=1,
-    )
-    action = jax.random.uniform(keys[2], (4_000, 1), minval=-1.0)
-    bound = float(state.hparams.bound)
-    f = np.arctanh(np.asarray(learner.reward(state, observation, action)) / bound)
+    rng = np.random.default_rng(1)
+    observation = np.stack([rng.normal(size=4_000), rng.uniform(-0.07, 0.07, 4_000)], axis=1)
+    pairs = np.float32(observation), np.float32(rng.uniform(-1.0, 1.0, (4_000, 1)))
+
+    @jax.jit
+    def share(key):
+        state = learner.init(key)
+        return learner.reward(state, *pairs) / state.hparams.bound
+
+    f = np.arctanh(np.asarray(share(KEY)))
     assert abs(f.mean()) < 0.1
     assert f.std() == pytest.approx(1.0, abs=0.1)

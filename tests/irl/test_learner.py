@@ -12,6 +12,7 @@ from tests.support import reference
 from tests.support.agents import SPEC, random_batch, scaled
 
 SMALL = rewards.mlp(SPEC, hidden=(5, 4))
+SMALL = SMALL._replace(init=jax.jit(SMALL.init))
 
 
 def learner(hparams, **kwargs):
@@ -58,12 +59,12 @@ def test_gradient_equals_finite_differences_of_a_float64_posterior(
     before, batches_ = algorithm.init(jax.random.key(0)), batches()
     density = [np.linspace(-1, 1, len(batch.action)) for batch in batches_]
     given = [
-        RewardBatch(batch, jnp.asarray(log_b, jnp.float32), jnp.ones(len(log_b), bool))
+        RewardBatch(batch, np.float32(log_b), np.ones(len(log_b), bool))
         for batch, log_b in zip(batches_, density, strict=True)
     ]
     # The last layer starts near zero, where bounded and unbounded rewards are nearly equal.
-    params = jax.tree.map(lambda leaf: 3.0 * leaf, before.params.network)
-    absorbed = jnp.asarray(0.07) if absorbing else None
+    params = jax.tree.map(lambda leaf: 3.0 * np.asarray(leaf), before.params.network)
+    absorbed = np.float32(0.07) if absorbing else None
     before = before.replace(params=before.params._replace(network=params, absorbing=absorbed))
     after, info = algorithm.update(before, *given)
 
@@ -99,20 +100,18 @@ def test_trajectories_give_the_gradient_of_a_float64_posterior_absorbing_states_
     )
     algorithm = learner(hparams)
     before = algorithm.init(jax.random.key(0))
-    before = before.replace(params=before.params._replace(absorbing=jnp.asarray(0.2)))
+    before = before.replace(params=before.params._replace(absorbing=np.float32(0.2)))
     steps = 4
     batches_, masks = [], []
     for seed, lengths in ((1, [4, 2, 3]), (2, [1, 4, 0])):
-        flat = random_batch(jax.random.key(seed), len(lengths) * steps)
+        flat = jax.device_get(random_batch(jax.random.key(seed), len(lengths) * steps))
         shaped = jax.tree.map(lambda x: x.reshape(-1, steps, *x.shape[1:]), flat)
         mask = np.arange(steps) < np.array(lengths)[:, None]
         last = np.arange(steps) == np.array(lengths)[:, None] - 1
         ended = last & np.array([[True], [True], [False]])
-        log_density = jnp.asarray([0.5, -0.3, 0.2])
+        log_density = np.float32([0.5, -0.3, 0.2])
         masks.append(mask)
-        batches_.append(
-            RewardBatch(shaped._replace(terminated=jnp.asarray(ended)), log_density, mask)
-        )
+        batches_.append(RewardBatch(shaped._replace(terminated=ended), log_density, mask))
     after, info = algorithm.update(before, *batches_)
 
     def negative_posterior(learned):
@@ -152,15 +151,17 @@ def test_the_gradient_penalty_is_taken_between_the_batches_and_needs_a_key():
         for algorithm, before in ((plain, state), (penalised, with_penalty))
     ]
     pairs = [(batch.observation, batch.action) for batch in batches_]
-    between = regularisers.interpolate(key, *pairs)
-    half_widths = (jnp.array([0.9, 0.07]), jnp.array([1.0]))
+    half_widths = np.float32([0.9, 0.07]), np.float32([1.0])
 
-    def penalty(params):
-        return regularisers.gradient_penalty(
-            lambda s, a: SMALL.apply(params, s, a), *between, jnp.ones(5, bool), scale=half_widths
+    @jax.jit
+    @jax.grad
+    def of_penalty(params):
+        between = regularisers.interpolate(key, *pairs)
+        return 0.5 * regularisers.gradient_penalty(
+            lambda s, a: SMALL.apply(params, s, a), *between, np.ones(5, bool), scale=half_widths
         )
 
-    expected = jax.tree.map(lambda leaf: 0.5 * leaf, jax.grad(penalty)(state.params.network))
+    expected = of_penalty(state.params.network)
     difference = jax.tree.map(np.subtract, moves[1].network, moves[0].network)
     chex.assert_trees_all_close(difference, expected, rtol=1e-3, atol=1e-6)
 
@@ -169,15 +170,16 @@ def test_the_gradient_penalty_is_taken_between_the_batches_and_needs_a_key():
 def test_the_gauge_follows_its_batches_and_is_subtracted_from_every_reward(gauge):
     algorithm = learner(IRLHParams(gauge=gauge, gauge_rate=0.25, absorbing=True))
     state, (demonstrations, background) = algorithm.init(jax.random.key(0)), batches()
-    bare = state.replace(params=state.params._replace(offset=jnp.zeros(())))
+    bare = state.replace(params=state.params._replace(offset=np.float32(0.0)))
     on = [algorithm.reward(bare, b.observation, b.action) for b in (demonstrations, background)]
-    target = on[1].mean() if gauge == "zero-mean" else on[0].max()
+    target = np.mean(on[1]) if gauge == "zero-mean" else np.max(on[0])
     after, _ = algorithm.update(state, demonstrations, background)
     np.testing.assert_allclose(after.params.offset, 0.25 * target, rtol=1e-5)
-    lifted = after.replace(params=after.params._replace(offset=after.params.offset + 1.0))
+    lifted = np.float32(1.0) + np.asarray(after.params.offset)
+    lifted = after.replace(params=after.params._replace(offset=lifted))
     pair = demonstrations.observation, demonstrations.action
     np.testing.assert_allclose(
-        algorithm.reward(lifted, *pair), algorithm.reward(after, *pair) - 1.0, atol=1e-6
+        algorithm.reward(lifted, *pair), np.asarray(algorithm.reward(after, *pair)) - 1.0, atol=1e-6
     )
     assert algorithm.absorbing(lifted) == pytest.approx(algorithm.absorbing(after) - 1.0)
 
@@ -226,43 +228,50 @@ def test_the_reward_stays_within_its_bound_however_long_it_learns():
     def step(state, _):
         return algorithm.update(state, demonstrations, background)
 
-    state, info = jax.jit(lambda s: jax.lax.scan(step, s, length=500))(
-        algorithm.init(jax.random.key(0))
-    )
-    r_d = algorithm.reward(state, demonstrations.observation, demonstrations.action)
-    assert jnp.abs(r_d).max() <= 0.1
+    @jax.jit
+    def learn(key):
+        state, info = jax.lax.scan(step, algorithm.init(key), length=500)
+        return algorithm.reward(state, demonstrations.observation, demonstrations.action), info
+
+    r_d, info = jax.device_get(learn(jax.random.key(0)))
+    assert np.abs(r_d).max() <= 0.1
     assert info.demonstration_reward[-1] - info.background_reward[-1] > 0.05
 
 
 def test_learnt_reward_ranks_demonstrated_actions_first():
     algorithm = irl.make(SPEC)
-    uniform = random_batch(jax.random.key(1), 512)
-    demonstrations = uniform._replace(action=0.5 * jnp.sign(uniform.observation[:, 1:]))
+    uniform = jax.device_get(random_batch(jax.random.key(1), 512))
+    demonstrations = uniform._replace(action=0.5 * np.sign(uniform.observation[:, 1:]))
 
     def step(state, key):
         index = jax.random.randint(key, (32,), 0, 512)
-        take = jax.tree.map(lambda leaf: leaf[index], (demonstrations, uniform))
+        take = jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], (demonstrations, uniform))
         return algorithm.update(state, *take)[0], None
 
-    keys = jax.random.split(jax.random.key(2), 500)
-    state, _ = jax.jit(lambda s: jax.lax.scan(step, s, keys))(algorithm.init(jax.random.key(0)))
-    opposite = -demonstrations.action
-    better = algorithm.reward(
-        state, demonstrations.observation, demonstrations.action
-    ) > algorithm.reward(state, demonstrations.observation, opposite)
-    assert better.mean() > 0.9
+    @jax.jit
+    def learn(key):
+        state, _ = jax.lax.scan(step, algorithm.init(key), jax.random.split(key, 500))
+        return [
+            algorithm.reward(state, demonstrations.observation, action)
+            for action in (demonstrations.action, -demonstrations.action)
+        ]
+
+    better, worse = jax.device_get(learn(jax.random.key(2)))
+    assert np.mean(better > worse) > 0.9
 
 
 def test_batched_states_rates_and_a_second_call():
     algorithm = irl.make(SPEC, network=SMALL)
-    states = jax.vmap(algorithm.init)(jnp.stack([jax.random.key(0)] * 2))
+    state = algorithm.init(jax.random.key(0))
+    states = jax.tree.map(lambda leaf: jnp.asarray(np.stack([leaf] * 2)), state)
     states = states.replace(hparams=states.hparams.replace(learning_rate=jnp.array([0.0, 1e-2])))
     update = jax.jit(jax.vmap(algorithm.update, in_axes=(0, None, None)), donate_argnums=0)
-    first = jax.tree.map(np.asarray, states.params.network)
+    first = jax.tree.map(np.array, states.params.network)
     for _ in range(2):
         states, _ = update(states, *batches())
     assert update._cache_size() == 1
-    pairs = zip(jax.tree.leaves(states.params.network), jax.tree.leaves(first), strict=True)
+    learnt = jax.device_get(states.params.network)
+    pairs = zip(jax.tree.leaves(learnt), jax.tree.leaves(first), strict=True)
     moved = np.any([(new != old).reshape(2, -1).any(axis=1) for new, old in pairs], axis=0)
     assert moved.tolist() == [False, True]
 

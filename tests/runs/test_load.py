@@ -1,5 +1,7 @@
 """What training gave, and what is loaded of it: the same numbers."""
 
+import functools
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -50,20 +52,23 @@ def trained(method, settings):
     return [state.agent.actor for state in states], [state.reward for state in states]
 
 
-def drawn(method, settings):
+@functools.cache
+def drawn_actors(architecture):
+    init = jax.jit(networks.make(SPEC, architecture).actor.init)
+    return [init(jax.random.key(seed)) for seed in range(SEEDS)]
+
+
+def drawn(method, settings, moved=0.1):
     """The actors and the reward states of seeds before their first step."""
-    parts = trainers.compiled(method, settings)[0].algorithm
-    keys = [jax.random.key(seed) for seed in range(SEEDS)]
-    agent, learner = jax.jit(parts.agent.init), jax.jit(parts.learner.init)
-    rewards = [learner(key) for key in keys]
+    # Not compiled, as what is loaded is not either: both run the same programs.
+    init = trainers.compiled(method, settings)[0].algorithm.learner.init
+    rewards = [init(jax.random.key(seed)) for seed in range(SEEDS)]
     # A table begins with zeros.
-    moved = [
-        reward.replace(
-            params=jax.tree.map(lambda leaf, seed=seed: leaf + 0.1 * (seed + 1), reward.params)
-        )
-        for seed, reward in enumerate(rewards)
-    ]
-    return [agent(key).actor for key in keys], moved
+    for seed, reward in enumerate(rewards):
+        by = np.float32(moved * (seed + 1))
+        params = jax.tree.map(lambda leaf, by=by: np.asarray(leaf) + by, reward.params)
+        rewards[seed] = reward.replace(params=params)
+    return drawn_actors(settings.architecture), rewards
 
 
 TRAINED = ("a gauge",)
@@ -111,7 +116,7 @@ def test_what_is_loaded_gives_the_numbers_that_training_gave(tmp_path, variant):
         r_d = load_reward(str(tmp_path), method, FIRST + seed)
         expected = learner.reward(reward, observations, actions)
         np.testing.assert_array_equal(r_d(OBSERVATIONS, ACTIONS), expected)
-        assert r_d(OBSERVATIONS[0], ACTIONS[0]).shape == ()
+        assert jax.eval_shape(r_d, OBSERVATIONS[0], ACTIONS[0]).shape == ()
     if variant == "a gauge":
         assert float(rewards[0].params.offset) != 0.0
 
@@ -119,32 +124,31 @@ def test_what_is_loaded_gives_the_numbers_that_training_gave(tmp_path, variant):
 def test_a_reward_that_was_trained_with_another_bound_is_not_that_of_the_default(tmp_path):
     """The mistake that saved parameters alone invite."""
     settings = trainers.with_(reward={"bound": 0.3})
-    actors, rewards = trained("me-ddpg", settings)
+    actors, rewards = drawn("me-ddpg", settings, moved=0.0)
     save(tmp_path, "me-ddpg", settings, stacked(actors), stacked([r.params for r in rewards]))
     found = load_reward(tmp_path, "me-ddpg", FIRST)(OBSERVATIONS, ACTIONS)
     by_default = compose.compose(SPEC, METHODS["me-ddpg"], trainers.SMALL, 100).learner
     state = by_default.init(jax.random.key(0)).replace(params=rewards[0].params)
-    np.testing.assert_allclose(
-        found, 3.0 * by_default.reward(state, OBSERVATIONS, ACTIONS), rtol=1e-5
-    )
+    expected = 3.0 * np.asarray(by_default.reward(state, OBSERVATIONS, ACTIONS))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("method", ["maxent-irl", "deep-maxent-irl"])
 def test_tables_of_methods_with_a_model_are_functions_too(tmp_path, method):
     tabular = TabularSettings(states=9, actions=3, steps=2, centres=3)
     settings = Settings(tabular=tabular)
-    mdp = imitation.discretised(pools.ENV, tabular)
+    mdp = jax.jit(lambda: imitation.discretised(pools.ENV, tabular))()
     data = hot_start.data(pools.scripted(3))
     kind = METHODS[method].tabular
     fit = jax.jit(lambda key: imitation.fit(key, mdp, SPEC, data, kind=kind, settings=tabular))
     fitted = [fit(jax.random.key(seed)) for seed in range(SEEDS)]
     tables = np.stack([result.policy.log_probabilities for result in fitted])
     save(tmp_path, method, settings, tables, np.stack([result.reward for result in fitted]))
-    act = load_policy(tmp_path, method, FIRST + 1)
+    act = jax.jit(load_policy(tmp_path, method, FIRST + 1))
     expected = discretise.greedy(mdp, fitted[1].policy.log_probabilities)(OBSERVATIONS)
     np.testing.assert_array_equal(act(OBSERVATIONS), expected)
     # At the points of the grid, the table itself.
-    r_d = load_reward(tmp_path, method, FIRST + 1)
+    r_d = jax.jit(load_reward(tmp_path, method, FIRST + 1))
     states, actions = interpolation.points(mdp.states), interpolation.points(mdp.actions)
     every = r_d(
         np.broadcast_to(states[:, None], (len(states), len(actions), 2)),
@@ -161,11 +165,10 @@ def run(tmp_path_factory):
         architecture=Architecture(hidden=(2,)),
         reward_network=RewardNetworkSettings(hidden=(2,)),
     )
-    actor = networks.make(SPEC, settings.architecture).actor
+    actors = stacked(drawn_actors(settings.architecture))
 
     def policies(scale):
-        drawn = stacked([actor.init(jax.random.key(seed)) for seed in range(SEEDS)])
-        return jax.tree.map(lambda leaf: scale * leaf, drawn)
+        return jax.tree.map(lambda leaf: scale * leaf, actors)
 
     save(folder, "ddpg", settings, policies(1.0), None, first_seed=0)
     save(folder, "ddpg", settings, policies(2.0), None, first_seed=SEEDS)

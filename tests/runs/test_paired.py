@@ -2,9 +2,15 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from cmedirl_jax.runs import paired
+from cmedirl_jax.runs import intervals, paired
 from cmedirl_jax.runs.intervals import Interval
 from cmedirl_jax.runs.paired import Difference
+
+
+@pytest.fixture
+def few_flips(monkeypatch):
+    """A test by fewer flips keeps its level, as long as they and one make whole twentieths."""
+    monkeypatch.setattr(paired, "FLIPS", 999)
 
 
 def rejections(draw, trials=200, level=0.05):
@@ -70,8 +76,10 @@ def test_a_cluster_that_differs_both_ways_differs_once():
     assert paired.equivalence(found, 0.02) == "inconclusive"
 
 
-def test_a_large_cluster_may_be_the_one_that_differs():
+def test_a_large_cluster_may_be_the_one_that_differs(few_flips, monkeypatch):
     """Sixty clusters; those that differ, one in twenty, have fifty pairs, the others one."""
+    # So few differ that the bound is the exact one.
+    monkeypatch.setattr(intervals, "RESAMPLES", 200)
 
     def bounded(trial):
         differs = np.random.default_rng(trial).random(60) < 0.05
@@ -100,7 +108,7 @@ def test_a_difference_in_every_pair_is_evidence():
     assert paired.p_value(-np.linspace(1, 2, 20), None) < 0.001
 
 
-def test_false_positives_are_at_the_level_for_unequal_shapes():
+def test_false_positives_are_at_the_level_for_unequal_shapes(few_flips):
     """Exponential against constant: equal means, differences far from symmetric."""
 
     def draw(rng):
@@ -117,7 +125,7 @@ def test_false_positives_are_at_the_level_for_unequal_shapes():
     assert np.isfinite(flips_of_bare_means(np.random.default_rng(0)))
 
 
-def test_false_positives_are_at_the_level_where_experts_carry_half_of_the_variance():
+def test_false_positives_are_at_the_level_where_experts_carry_half_of_the_variance(few_flips):
     clusters = np.repeat(np.arange(16), 6)
 
     def draw(rng):
@@ -127,7 +135,7 @@ def test_false_positives_are_at_the_level_where_experts_carry_half_of_the_varian
     assert rejections(lambda rng: (draw(rng)[0], None)) >= 0.15
 
 
-def test_real_differences_are_found():
+def test_real_differences_are_found(few_flips):
     assert rejections(lambda rng: (rng.normal(0.5, 1.0, 100), None)) >= 0.95
 
 
@@ -151,7 +159,7 @@ def test_equivalence_is_an_interval_within_the_margin(low, high, expected):
     assert paired.equivalence(Difference(narrow, 0.5, narrow, 10), 1.0) == expected
 
 
-def test_equivalence_is_claimed_falsely_in_at_most_a_twentieth():
+def test_equivalence_is_claimed_falsely_in_at_most_a_twentieth(few_flips):
     """The true difference lies on the margin."""
     found = [
         paired.equivalence(

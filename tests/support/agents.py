@@ -28,7 +28,7 @@ def random_batch(key, size, spec=SPEC):
         terminated=rng.random(size) < 0.3,
     )
     return jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, None if leaf.dtype == bool else jnp.float32), batch
+        lambda leaf: jnp.asarray(leaf if leaf.dtype == bool else leaf.astype(np.float32)), batch
     )
 
 

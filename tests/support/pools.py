@@ -23,23 +23,27 @@ def controller(observation, push=0.3):
 @functools.cache
 def scripted(episodes=12, push=0.3):
     """`episodes` episodes of `controller`, at rest from -0.6 to -0.4."""
-    rows = []
-    advance = jax.jit(ENV.step)
-    for index, position in enumerate(np.linspace(-0.6, -0.4, episodes, dtype=np.float32)):
-        observation, done = jnp.array([position, 0.0]), False
-        state = ENV.state_at(observation, ENV.default_params)
-        while not done:
-            action = controller(observation, push)
-            state, step = advance(jax.random.key(0), state, action, ENV.default_params)
-            done = bool(step.terminated | step.truncated)
-            transition = Transition(
-                observation, action, step.reward, step.observation, step.terminated
-            )
-            rows.append((*transition, step.truncated & ~step.terminated, np.int32(index)))
-            observation = step.observation
-    columns = [np.stack(column) for column in zip(*rows, strict=True)]
-    metadata = {"env": ENV.spec.id}
-    return Demonstrations(Transition(*columns[:5]), columns[5], columns[6], metadata)
+    params = ENV.default_params
+
+    def advance(carry, _):
+        state, observation = carry
+        action = controller(observation, push)
+        state, step = ENV.step(jax.random.key(0), state, action, params)
+        row = Transition(observation, action, step.reward, step.observation, step.terminated)
+        return (state, step.observation), (row, step.truncated & ~step.terminated)
+
+    def play(position):
+        observation = jnp.stack([position, 0.0])
+        start = ENV.state_at(observation, params), observation
+        return jax.lax.scan(advance, start, length=ENV.spec.max_episode_steps)[1]
+
+    positions = np.linspace(-0.6, -0.4, episodes, dtype=np.float32)
+    transition, truncated = jax.device_get(jax.jit(jax.vmap(play))(positions))
+    ended = transition.terminated | truncated
+    played = np.cumsum(ended, axis=1) - ended == 0
+    transition = jax.tree.map(lambda leaf: leaf[played], transition)
+    episode = np.nonzero(played)[0].astype(np.int32)
+    return Demonstrations(transition, truncated[played], episode, {"env": ENV.spec.id})
 
 
 def for_learners(pool, learners=8):

@@ -50,13 +50,29 @@ def with_(settings=SMALL, **changes):
 @functools.cache
 def compiled(method, settings=SMALL, capacity=400):
     trainer = training.make(ENV, METHODS[method], settings, capacity=capacity)
-    return trainer, trainer.init, jax.jit(trainer.run)
+    # The fit of a table is hundreds of small programs where it is not one.
+    init = trainer.init
+    if METHODS[method].tabular:
+        init = jax.jit(init, static_argnums=2)
+    return trainer, init, jax.jit(trainer.run)
+
+
+@functools.cache
+def networks(method, architecture, hot_start, key):
+    """What a method's `init` starts from, hot-started once for all its other settings."""
+    settings = dataclasses.replace(SMALL, architecture=architecture, hot_start=hot_start)
+    trainer, _, _ = compiled(method, settings)
+    key = jax.random.key(key)
+    return trainer.hot_start(key, data(), 3, trainer.draw_networks(key))
 
 
 def start(method, settings=SMALL, key=0, **kwargs):
     trainer, init, run = compiled(method, settings, **kwargs)
     pool = data() if METHODS[method].uses_demonstrations else None
-    state = init(jax.random.key(key), pool, 3)
+    hot = None
+    if METHODS[method].hot_start:
+        hot = networks(method, settings.architecture, settings.hot_start, key)
+    state = init(jax.random.key(key), pool, 3, hot)
 
     def advance(state, begin, end, max_episodes=None):
         """Step by step: each number of steps at once would be a program to compile."""

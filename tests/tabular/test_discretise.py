@@ -1,5 +1,4 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -33,8 +32,9 @@ def true_steps(env, mdp):
 def test_state_at_gives_the_state_of_an_observation(env):
     params = env.default_params
     state, observation = env.reset(jax.random.key(0), params)
+    advance = jax.jit(env.step)
     for _ in range(5):
-        state, step = env.step(jax.random.key(0), state, jnp.array([0.7]), params)
+        state, step = advance(jax.random.key(0), state, np.float32([0.7]), params)
         observation = step.observation
     again = env.state_at(observation, params)
     assert (again.position, again.velocity, again.time) == (state.position, state.velocity, 0)
@@ -71,12 +71,11 @@ def test_subsamples_average_over_the_cell(env, mdp):
     half = mdp.states.spacing / 4
     around = points(mdp.states)[state] + half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
     params = env.default_params
-    steps = [
-        env.step(
-            jax.random.key(0), env.state_at(place, params), points(mdp.actions)[action], params
-        )
-        for place in jnp.asarray(around, jnp.float32)
-    ]
+    push = points(mdp.actions)[action]
+    from_place = jax.jit(
+        lambda place: env.step(jax.random.key(0), env.state_at(place, params), push, params)
+    )
+    steps = [from_place(place) for place in np.float32(around)]
     index, weight = (np.asarray(leaf)[state, action] for leaf in finer.dynamics)
     np.testing.assert_allclose(
         weight @ points(mdp.states)[index],
@@ -119,13 +118,14 @@ def test_the_discretised_optimum_solves_the_continuous_task(env):
 
 @pytest.mark.optimised
 def test_stochastic_policies_draw_their_actions(env, mdp):
-    uniform = jnp.zeros_like(mdp.reward)
-    always_right = jnp.where(jnp.arange(5) == 4, 0.0, -jnp.inf) + uniform
+    uniform = np.zeros(mdp.reward.shape, np.float32)
+    always_right = np.where(np.arange(5) == 4, np.float32(0.0), -np.inf) + uniform
     params = env.default_params
     drawing = discretise.sampled(mdp, env)
     checks.env_spec(drawing.spec)
     assert drawing.spec.action_dim == 5
 
+    @jax.jit
     def returns(preference):
         return evaluation.rollout(
             lambda o: discretise.look_up(mdp, preference, o),

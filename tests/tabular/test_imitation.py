@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import re
 
 import jax
@@ -40,7 +41,8 @@ def test_visitation_counts_discounted_steps_where_they_were(data, mdp, chosen):
         start = np.append(np.asarray(pool.start)[chosen], pool.start[1])
         length = np.append(np.asarray(pool.length)[chosen], 0)
         subset = DemonstrationSubset(jnp.asarray(start), jnp.asarray(length))
-    counted = jax.jit(lambda subset: imitation.visitation(mdp, data, subset, discount=0.9))(subset)
+    count = jax.jit(lambda subset: imitation.visitation(mdp, data, subset, discount=0.9))
+    counted = jax.device_get(count(subset))
     total, place, action, first = 0.0, np.zeros(2), np.zeros(1), np.zeros(2)
     for episode in which:
         begin, steps = int(pool.start[episode]), int(pool.length[episode])
@@ -65,8 +67,9 @@ def test_steps_of_episodes_that_are_not_the_learners_count_nothing(data, mdp, bl
     own = DemonstrationSubset(*(np.asarray(leaf)[block] for leaf in data.episodes))
     # So many steps lie before and after that a discount to their power is 0 or infinite.
     assert data.transition.reward.size > 10 * 126
-    mine = imitation.visitation(mdp, data._replace(episodes=own), own, discount=0.5)
-    subset = imitation.visitation(mdp, data, own, discount=0.5)
+    count = functools.partial(imitation.visitation, mdp, discount=0.5)
+    both = jax.jit(lambda: (count(data._replace(episodes=own), own), count(data, own)))
+    mine, subset = both()
     for actual, expected in zip(mine[:2], subset[:2], strict=True):
         assert np.isfinite(actual).all()
         np.testing.assert_allclose(actual, expected, rtol=1e-6)

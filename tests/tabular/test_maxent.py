@@ -23,14 +23,13 @@ def float64():
         yield
 
 
+@functools.partial(jax.jit, static_argnames=("discount", "horizon"))
 def expert(dynamics, reward, initial, absorbing, discount=0.9, horizon=None):
     """The exact visitation of the soft-optimal policy of `reward`."""
     kwargs = {"discount": discount, "horizon": horizon, "absorbing": absorbing}
-    policy = tabular.soft_value_iteration(dynamics, jnp.asarray(reward), stop=EXACT, **kwargs)
-    visitation = tabular.expected_visitation(
-        dynamics, policy, jnp.asarray(initial), stop=EXACT, **kwargs
-    )
-    return TabularDemonstrations(visitation, jnp.asarray(initial))
+    policy = tabular.soft_value_iteration(dynamics, reward, stop=EXACT, **kwargs)
+    visitation = tabular.expected_visitation(dynamics, policy, initial, stop=EXACT, **kwargs)
+    return TabularDemonstrations(visitation, initial)
 
 
 def two_layers(inputs, hidden=32):
@@ -42,15 +41,11 @@ def two_layers(inputs, hidden=32):
     return networks.scalar_output(Network(init, mlp.apply))
 
 
-@pytest.mark.parametrize("temperature", [1.0, 0.5])
-@pytest.mark.parametrize("horizon", [None, 4])
-@pytest.mark.parametrize("state_only", [False, True])
-def test_a_step_follows_the_log_posteriors_gradient(state_only, horizon, temperature):
-    """Autodiff through the whole log-likelihood, against the difference in visitation."""
+@functools.partial(jax.jit, static_argnames="horizon")
+def two_steps(features, temperature, horizon):
+    """The fit after one step and after two; the log-posterior after one, and its gradient."""
     dynamics, reward, initial, ends = mdps.random_mdp(0, absorbing=True)
     demonstrations = expert(dynamics, reward, initial, ends, horizon=horizon)
-    rng = np.random.default_rng(1)
-    features = rng.normal(size=(4, 2) if state_only else (4, 3, 2))
     kwargs = {"discount": 0.9, "horizon": horizon, "absorbing": ends, "stop": EXACT}
     first, second = (
         tabular.maxent_irl(
@@ -73,11 +68,18 @@ def test_a_step_follows_the_log_posteriors_gradient(state_only, horizon, tempera
         data = jnp.sum(demonstrations.visitation * reward) - value
         return data / temperature - 0.15 * jnp.sum(theta**2)
 
-    gradient = jax.grad(log_posterior)(first.params)
+    return first, second, *jax.value_and_grad(log_posterior)(first.params)
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.5])
+@pytest.mark.parametrize("horizon", [None, 4])
+@pytest.mark.parametrize("state_only", [False, True])
+def test_a_step_follows_the_log_posteriors_gradient(state_only, horizon, temperature):
+    """Autodiff through the whole log-likelihood, against the difference in visitation."""
+    features = np.random.default_rng(1).normal(size=(4, 2) if state_only else (4, 3, 2))
+    first, second, value, gradient = jax.device_get(two_steps(features, temperature, horizon))
     np.testing.assert_allclose(second.params, first.params + 0.1 * gradient, atol=1e-10)
-    np.testing.assert_allclose(
-        second.info.log_likelihood[1] + second.info.log_prior[1], log_posterior(first.params)
-    )
+    np.testing.assert_allclose(second.info.log_likelihood[1] + second.info.log_prior[1], value)
     if state_only:
         np.testing.assert_array_equal(first.reward, first.reward[:, :1].repeat(3, axis=1))
 
@@ -86,14 +88,18 @@ def test_a_reward_of_states_sees_the_sum_over_actions():
     """mu_D = sum_a mu_D^a, as below Eq. 9: only the state's visits move a reward of states."""
     dynamics, reward, initial, _ = mdps.random_mdp(1)
     demonstrations = expert(dynamics, reward, initial, None)
-    shuffled = demonstrations._replace(visitation=demonstrations.visitation[:, ::-1])
+    backwards = np.asarray(demonstrations.visitation)[:, ::-1]
+    shuffled = demonstrations._replace(visitation=backwards)
+
+    @jax.jit
+    def fitted(features, given):
+        result = tabular.maxent_irl(
+            dynamics, features, given, discount=0.9, optimizer=optax.sgd(0.1), steps=1
+        )
+        return result.params
+
     of_states, of_pairs = (
-        [
-            tabular.maxent_irl(
-                dynamics, features, given, discount=0.9, optimizer=optax.sgd(0.1), steps=1
-            ).params
-            for given in (demonstrations, shuffled)
-        ]
+        [np.asarray(fitted(features, given)) for given in (demonstrations, shuffled)]
         for features in (np.eye(4), np.eye(12).reshape(4, 3, 12))
     )
     np.testing.assert_allclose(*of_states, rtol=1e-12)
@@ -105,7 +111,7 @@ def test_the_optimum_matches_the_demonstrations_visitation(optimizer):
     dynamics, reward, initial, ends = mdps.random_mdp(2, absorbing=True)
     demonstrations = expert(dynamics, reward, initial, ends)
     features = np.eye(12).reshape(4, 3, 12)
-    result = jax.jit(
+    fit = jax.jit(
         lambda: tabular.maxent_irl(
             dynamics,
             features,
@@ -116,7 +122,8 @@ def test_the_optimum_matches_the_demonstrations_visitation(optimizer):
             steps=400,
             stop=EXACT,
         )
-    )()
+    )
+    result = jax.device_get(fit())
     np.testing.assert_allclose(result.visitation, demonstrations.visitation, atol=1e-4)
     assert result.info.log_likelihood[-1] >= result.info.log_likelihood.max() - 1e-9
     assert result.info.visitation_error[-1] < 1e-3 < result.info.visitation_error[0]
@@ -193,49 +200,66 @@ def test_the_likelihood_equals_that_among_all_trajectories():
     np.testing.assert_allclose(found, np.mean(logs), rtol=1e-9)
 
 
-@pytest.mark.parametrize("slip", [0.0, 0.2])
-@pytest.mark.parametrize("deep", [False, True], ids=["linear", "deep"])
-def test_the_reward_of_a_gridworld_is_recovered(deep, slip):
-    """From 1,000 sampled episodes: the policy it induces has 0.99 of the expert's value."""
+CELLS = 25
+ROW, COLUMN = np.divmod(np.arange(CELLS), 5)
+SWAMP = np.where((ROW == 2) & (COLUMN < 3), -6.0, -2.0)[:, None].repeat(4, axis=1)
+"""A reward of the gridworld."""
+
+
+@functools.cache
+def sampled(slip):
+    """The gridworld, its optimal policy, and 1,000 episodes of that."""
     dynamics, ends = mdps.gridworld(5, slip)
-    states = len(dynamics)
-    row, column = np.divmod(np.arange(states), 5)
-    swamp = (row == 2) & (column < 3)
-    truth = np.where(swamp, -6.0, -2.0)[:, None].repeat(4, axis=1)
-    kwargs = {"discount": 0.95, "absorbing": ends}
-    starts = np.full(states, ~ends / (states - 1))
-    ideal = tabular.soft_value_iteration(dynamics, jnp.asarray(truth), stop=EXACT, **kwargs)
+    starts = np.full(CELLS, ~ends / (CELLS - 1))
+    solve = jax.jit(functools.partial(tabular.soft_value_iteration, discount=0.95, stop=EXACT))
+    ideal = jax.device_get(solve(dynamics, SWAMP, absorbing=ends))
     rng = np.random.default_rng(0)
     episodes = np.zeros((1000, 100, 2), int)
     mask = np.zeros((1000, 100), bool)
     for episode in range(1000):
-        state = rng.choice(states, p=starts)
+        state = rng.choice(CELLS, p=starts)
         for time in range(100):
             if ends[state]:
                 break
             action = rng.choice(4, p=np.exp(ideal.log_probabilities[state]))
             episodes[episode, time], mask[episode, time] = (state, action), True
-            state = rng.choice(states, p=dynamics[state, action])
-    demonstrations = tabular.empirical_visitation(
-        *np.moveaxis(episodes, -1, 0), mask, (states, 4), discount=0.95
-    )
-    fit = (
-        functools.partial(
-            tabular.deep_maxent_irl, jax.random.key(0), two_layers(states), (np.eye(states),)
+            state = rng.choice(CELLS, p=dynamics[state, action])
+    return dynamics, ends, starts, ideal, (*np.moveaxis(episodes, -1, 0), mask)
+
+
+@functools.cache
+def compiled_recovery(deep):
+    """The values of the policy that the fitted reward induces, and of another one."""
+
+    @jax.jit
+    def recover(dynamics, ends, starts, ideal, steps):
+        kwargs = {"discount": 0.95, "absorbing": ends}
+        fit = (
+            functools.partial(
+                tabular.deep_maxent_irl, jax.random.key(0), two_layers(CELLS), (np.eye(CELLS),)
+            )
+            if deep
+            else functools.partial(tabular.maxent_irl, features=np.eye(CELLS))
         )
-        if deep
-        else functools.partial(tabular.maxent_irl, features=np.eye(states))
-    )
-    result = jax.jit(
-        lambda: fit(
+        demonstrations = tabular.empirical_visitation(*steps, (CELLS, 4), discount=0.95)
+        result = fit(
             dynamics=dynamics, demonstrations=demonstrations, prior_precision=1e-4, **kwargs
         )
-    )()
-    values = []
-    for policy in (result.policy, ideal):
-        mu = tabular.expected_visitation(dynamics, policy, jnp.asarray(starts), **kwargs)
-        values.append(float(jnp.sum(mu * (truth - policy.log_probabilities))))
-    found_value, ideal_value = values
+
+        def value(policy):
+            mu = tabular.expected_visitation(dynamics, policy, starts, **kwargs)
+            return jnp.sum(mu * (SWAMP - policy.log_probabilities))
+
+        return value(result.policy), value(ideal)
+
+    return recover
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.2])
+@pytest.mark.parametrize("deep", [False, True], ids=["linear", "deep"])
+def test_the_reward_of_a_gridworld_is_recovered(deep, slip):
+    """From 1,000 sampled episodes: the policy it induces has 0.99 of the expert's value."""
+    found_value, ideal_value = compiled_recovery(deep)(*sampled(slip))
     # The values include entropy, so that the expert's is the largest; both are negative.
     assert ideal_value / 0.99 <= found_value <= ideal_value < -5.0
 
@@ -253,8 +277,8 @@ def test_seeds_vmap():
         )
         return result.reward, result.visitation
 
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *every)
-    together = jax.jit(jax.vmap(fit))(keys, stacked)
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *every)
+    together = jax.device_get(jax.jit(jax.vmap(fit))(keys, stacked))
     alone = jax.jit(fit)
     for index, demonstrations in enumerate(every):
         one = jax.tree.map(lambda leaf, index=index: leaf[index], together)

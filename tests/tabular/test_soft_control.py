@@ -81,7 +81,7 @@ def test_visitation_equals_the_sum_over_all_trajectories(discount, deterministic
 @pytest.mark.parametrize("absorbing", [False, True])
 def test_fixed_points_equal_matrix_solves(absorbing):
     dynamics, reward, initial, ends = mdps.random_mdp(3, 6, absorbing=absorbing)
-    policy = soft(dynamics, reward, absorbing=ends)
+    policy = jax.device_get(soft(dynamics, reward, absorbing=ends))
     probabilities = np.exp(policy.log_probabilities)
     if absorbing:
         probabilities[ends] = 0.0
@@ -111,16 +111,24 @@ def test_sparse_equals_dense(seed, absorbing, horizon):
     chex.assert_trees_all_close(*solutions, rtol=1e-9, atol=1e-12)
 
 
-def likelihood(dynamics, demonstrations, reward, discount, **kwargs):
-    """1/N sum_i sum_t gamma^t log pi_t(a_t | s_t), step by step."""
-    policy = soft(dynamics, reward, discount=discount, **kwargs)
-    total = 0.0
-    for pairs in demonstrations:
+@functools.partial(jax.jit, static_argnames="horizon")
+def likelihoods_gradient(dynamics, reward, weights, index, **kwargs):
+    """Of the sum of weight * log pi_t(a_t | s_t) over the steps of `index`."""
+
+    def likelihood(reward):
+        return weights @ soft(dynamics, reward, **kwargs).log_probabilities[index]
+
+    return jax.grad(likelihood)(reward)
+
+
+def weighted_steps(shares, discount, horizon):
+    """Each step's probability * gamma^t, and its place `(t, s, a)` in a policy, or `(s, a)`."""
+    weights, steps = [], []
+    for probability, pairs in shares:
         for time, pair in enumerate(pairs):
-            log_pi = policy.log_probabilities
-            log_pi = log_pi if kwargs.get("horizon") is None else log_pi[time]
-            total += discount**time * log_pi[pair]
-    return total / len(demonstrations)
+            weights.append(probability * discount**time)
+            steps.append(pair if horizon is None else (time, *pair))
+    return np.array(weights), tuple(np.array(steps).T)
 
 
 @pytest.mark.parametrize(
@@ -139,10 +147,9 @@ def test_the_likelihoods_gradient_is_the_difference_in_visitation(discount, hori
     starts = [0, 1, 1, 3, 2, 0]
     demonstrations = mdps.demonstrate(dynamics, starts, horizon or 1000, ends, seed=0)
     kwargs = {"discount": discount, "horizon": horizon, "absorbing": ends}
-    gradient = jax.grad(lambda r: likelihood(dynamics, demonstrations, r, **kwargs))(
-        jnp.asarray(reward)
-    )
     shares = [(1 / len(demonstrations), pairs) for pairs in demonstrations]
+    steps = weighted_steps(shares, discount, horizon)
+    gradient = likelihoods_gradient(dynamics, reward, *steps, **kwargs)
     initial = np.bincount(starts, minlength=5) / len(starts)
     expected = mdps.counted_visits(shares, discount, reward.shape) - visits(
         dynamics, soft(dynamics, reward, **kwargs), initial, **kwargs
@@ -159,17 +166,9 @@ def test_with_stochastic_dynamics_it_holds_in_expectation(horizon):
     horizon = min(horizon, 4)
     every = list(mdps.trajectories(dynamics, other[:horizon], initial, ends))
     kwargs = {"discount": 0.8, "horizon": horizon, "absorbing": ends}
-    weights, steps = [], []
-    for probability, pairs in every:
-        for time, (state, action) in enumerate(pairs):
-            weights.append(probability * 0.8**time)
-            steps.append((time, state, action))
-    index = tuple(np.array(steps).T)
-
-    def expected_likelihood(reward):
-        return np.array(weights) @ soft(dynamics, reward, **kwargs).log_probabilities[index]
-
-    gradient = jax.grad(expected_likelihood)(jnp.asarray(reward))
+    gradient = likelihoods_gradient(
+        dynamics, reward, *weighted_steps(every, 0.8, horizon), **kwargs
+    )
     policy = soft(dynamics, reward, **kwargs)
     expected = mdps.counted_visits(every, 0.8, reward.shape) - visits(
         dynamics, policy, initial, **kwargs
@@ -183,6 +182,7 @@ def test_fixed_points_are_differentiable(mode):
     dynamics, reward, initial, ends = mdps.random_mdp(7, absorbing=True)
     weights = np.random.default_rng(0).normal(size=reward.shape)
 
+    @jax.jit
     def measure(reward):
         policy = soft(dynamics, reward, absorbing=ends)
         return initial @ policy.values + jnp.sum(
@@ -222,8 +222,8 @@ def test_vmaps_over_rewards_and_does_not_recompile():
 
         return jax.vmap(one)(rewards)
 
-    rewards = jnp.stack([jnp.asarray(reward), 3.0 * reward, -reward])
-    values, mu = both(rewards)
+    rewards = np.stack([reward, 3.0 * reward, -reward])
+    values, mu = jax.device_get(both(rewards))
     both(2.0 * rewards)
     for index, reward in enumerate(rewards):
         policy = soft(dynamics, reward, absorbing=ends)

@@ -12,6 +12,7 @@ STATES, ACTIONS = discretise.grids(pools.ENV.spec, (6, 5), (3,))
 TABLE = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
 VISITS = np.arange(30, dtype=np.float32) % 4
 LEARNER = table_reward.make(STATES, ACTIONS)
+reward_of = jax.jit(LEARNER.reward)
 
 
 def table_state(table=TABLE, bound=10.0, deviation=0.05):
@@ -33,23 +34,24 @@ def test_the_reward_is_the_table_at_the_grids_points():
     state = table_state()
     observation = np.repeat(interpolation.points(STATES)[:, None], 3, axis=1)
     action = np.broadcast_to(interpolation.points(ACTIONS), (30, 3, 1))
-    reward = LEARNER.reward(state, observation, action)
+    reward = reward_of(state, observation, action)
     np.testing.assert_allclose(reward, state.params, atol=1e-5)
 
 
 def test_between_the_points_it_is_linear_in_the_action():
     state = table_state()
-    observation = jnp.tile(jnp.array([-0.31, 0.013]), (3, 1))
-    low, middle, high = LEARNER.reward(state, observation, jnp.array([[-1.0], [-0.75], [0.0]]))
+    observation = np.tile(np.float32([-0.31, 0.013]), (3, 1))
+    action = np.float32([[-1.0], [-0.75], [0.0]])
+    low, middle, high = np.asarray(reward_of(state, observation, action))
     np.testing.assert_allclose(middle, 0.75 * low + 0.25 * high, rtol=1e-5)
 
 
 def test_it_learns_nothing():
     state = table_state()
     batch = jax.tree.map(lambda leaf: leaf[:4], pools.scripted().transition)
-    after, _ = LEARNER.update(state, batch, batch)
+    after, _ = jax.jit(LEARNER.update)(state, batch, batch)
     np.testing.assert_array_equal(after.params, state.params)
-    nothing = LEARNER.reward(LEARNER.init(jax.random.key(0)), *batch[:2])
+    nothing = reward_of(LEARNER.init(jax.random.key(0)), *batch[:2])
     assert nothing.tolist() == [0.0] * 4
     np.testing.assert_array_equal(shaping.additive(batch.reward, nothing), batch.reward)
 

@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 
@@ -23,44 +24,62 @@ from tests.support import pools
 
 GOLDEN = Path(__file__).with_name("golden.json")
 SEEDS, STEPS, LEARNING_STARTS = 2, 120, 40
+SETTINGS = dataclasses.replace(
+    Settings(),
+    schedule=Schedule(learning_starts=LEARNING_STARTS),
+    hot_start=HotStartHParams(steps=30),
+)
+
+
+@functools.cache
+def prepared():
+    return jax.tree.map(jnp.asarray, hot_start.data(pools.scripted()))
+
+
+@functools.cache
+def beginning(hot):
+    """Compiled once for all methods: `key -> networks`, hot-started or as they are drawn."""
+    trainer = training.make(pools.ENV, METHODS["bc" if hot else "ddpg"], SETTINGS, capacity=STEPS)
+    if not hot:
+        return jax.jit(trainer.draw_networks)
+    return jax.jit(lambda key, drawn: trainer.hot_start(key, prepared(), 3, drawn))
 
 
 def short_run(name):
     """Norms of what was learned, where the car is, and the last update's diagnostics."""
-    settings = dataclasses.replace(
-        Settings(),
-        schedule=Schedule(learning_starts=LEARNING_STARTS),
-        hot_start=HotStartHParams(steps=30),
-    )
     method = METHODS[name]
-    data = hot_start.data(pools.scripted()) if method.uses_demonstrations else None
-    trainer = training.make(pools.ENV, method, settings, capacity=STEPS)
+    data = prepared() if method.uses_demonstrations else None
+    trainer = training.make(pools.ENV, method, SETTINGS, capacity=STEPS)
 
+    # One seed's program compiles faster than that of several.
     @jax.jit
-    @jax.vmap
-    def run(key):
-        return trainer.run(trainer.init(key, data, 3), data, jnp.arange(STEPS))
+    def train(key, networks):
+        return trainer.run(trainer.init(key, data, 3, networks), data, jnp.arange(STEPS))
 
-    state, log = run(seeds.keys(jax.random.key(8), SEEDS))
+    def run(key):
+        networks = beginning(hot=False)(key)
+        if method.hot_start:
+            networks = beginning(hot=True)(key, networks)
+        return train(key, networks)
 
     def norms(tree):
-        return [
-            np.sqrt(np.square(np.asarray(leaf, np.float64)).sum(axis=tuple(range(1, leaf.ndim))))
-            for leaf in jax.tree.leaves(tree)
-        ]
+        return [np.linalg.norm(np.asarray(leaf, np.float64)) for leaf in jax.tree.leaves(tree)]
 
-    values = {
-        "actor": norms(state.agent.actor),
-        "critic": norms(state.agent.critic),
-        "target_critic": norms(state.agent.target_critic),
-        "reward": [] if state.reward is None else norms(state.reward.params.network),
-        "observation": state.observation,
-        "episode_return": state.episode_return,
-        "replay": norms(state.storage),
-        "q_mean": log.q_mean[:, -1],
-        "critic_loss": log.critic_loss[:, -1],
-    }
-    return {key: np.asarray(value, np.float64).tolist() for key, value in values.items()}
+    def values(state, log):
+        return {
+            "actor": norms(state.agent.actor),
+            "critic": norms(state.agent.critic),
+            "target_critic": norms(state.agent.target_critic),
+            "reward": [] if state.reward is None else norms(state.reward.params.network),
+            "observation": np.asarray(state.observation),
+            "episode_return": np.asarray(state.episode_return),
+            "replay": norms(state.storage),
+            "q_mean": np.asarray(log.q_mean)[-1],
+            "critic_loss": np.asarray(log.critic_loss)[-1],
+        }
+
+    of_seeds = [values(*run(key)) for key in seeds.keys(jax.random.key(8), SEEDS)]
+    return jax.tree.map(lambda *leaves: np.stack(leaves).astype(float).tolist(), *of_seeds)
 
 
 @pytest.mark.parametrize("name", ["ddpg", "hs-ddpg", "me-ddpg", "hs-me-ddpg"])

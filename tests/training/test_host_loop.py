@@ -38,6 +38,12 @@ def begin(method, settings=SMALL):
     return trainer, halves, vector, states
 
 
+@pytest.fixture(scope="module")
+def plain():
+    """DDPG's halves, whose states are to be copied before they are stepped."""
+    return begin("ddpg")
+
+
 @pytest.mark.parametrize("method", [pytest.param("ddpg", marks=pytest.mark.slow), "hs-me-ddpg"])
 def test_it_learns_what_run_learns_in_jax(method):
     pool = data() if METHODS[method].uses_demonstrations else None
@@ -59,18 +65,18 @@ def test_it_learns_what_run_learns_in_jax(method):
     assert states.episode.tolist() == [1] * SEEDS
 
 
-def test_a_second_call_compiles_nothing():
-    _, halves, vector, states = begin("ddpg")
-    steps = np.arange(LIMIT, dtype=np.int32)
+def test_a_second_call_compiles_nothing(plain):
+    _, halves, vector, states = plain
+    states, steps = jax.tree.map(jnp.copy, states), np.arange(LIMIT, dtype=np.int32)
     states, _ = host_loop.run(halves, vector, states, None, steps)
     host_loop.run(halves, vector, states, None, steps + LIMIT)
     for function in (halves.behave, halves.learn, halves.seeds):
         assert function._cache_size() == 1
 
 
-def test_a_seeds_starts_depend_on_its_key_and_step_alone():
-    _, halves, _, states = begin("ddpg")
-    one = jax.tree.map(lambda leaf: leaf[1:2], states)
+def test_a_seeds_starts_depend_on_its_key_and_step_alone(plain):
+    _, halves, _, states = plain
+    one = jax.jit(lambda states: jax.tree.map(lambda leaf: leaf[1:2], states))(states)
     for step in (0, 7):
         numbers = np.asarray(halves.seeds(states, np.int32(step)))
         assert len(set(numbers.tolist())) == SEEDS
@@ -79,7 +85,7 @@ def test_a_seeds_starts_depend_on_its_key_and_step_alone():
 
 
 def test_an_episode_that_is_cut_off_is_no_trajectory():
-    _, halves, vector, states = begin("hs-me-ddpg", TRAJECTORIES)
+    _, halves, vector, states = begin("me-ddpg", TRAJECTORIES)
     pool, cut = data(), 25
     states, _ = host_loop.run(halves, vector, states, pool, np.arange(cut, dtype=np.int32))
     start = stepping.reset(vector, np.asarray(halves.seeds(states, np.int32(cut - 1))))
@@ -101,18 +107,18 @@ def test_an_interruption_between_two_episodes_changes_nothing():
     task = envs.from_gymnasium(host_tasks.Dock, max_episode_steps=limit)
     trainer = training.make(task, METHODS["ddpg"], SMALL, capacity=400)
     halves = host_loop.compile_halves(trainer, limit)
-    ends = []
-    for interrupted in (False, True):
-        vector = task.vector(SEEDS)
-        states = host_loop.begin(halves, trainer, vector, seeds.keys(jax.random.key(0), SEEDS))
-        states, _ = host_loop.run(halves, vector, states, None, np.arange(limit, dtype=np.int32))
-        assert states.episode_length.tolist() == [0] * SEEDS
-        if interrupted:
-            vector = task.vector(SEEDS)
-            start = stepping.reset(vector, np.asarray(halves.seeds(states, np.int32(limit - 1))))
-            states = halves.begin_episode((states, start), np.int32(limit))
-        later = np.arange(limit, 2 * limit, dtype=np.int32)
-        ends.append(host_loop.run(halves, vector, states, None, later)[0])
+    vector = task.vector(SEEDS)
+    states = host_loop.begin(halves, trainer, vector, seeds.keys(jax.random.key(0), SEEDS))
+    steps = np.arange(limit, dtype=np.int32)
+    states, _ = host_loop.run(halves, vector, states, None, steps)
+    assert states.episode_length.tolist() == [0] * SEEDS
+    another = task.vector(SEEDS)
+    start = stepping.reset(another, np.asarray(halves.seeds(states, np.int32(limit - 1))))
+    interrupted = halves.begin_episode((states, start), np.int32(limit))
+    ends = [
+        host_loop.run(halves, vector, states, None, limit + steps)[0]
+        for vector, states in ((vector, states), (another, interrupted))
+    ]
     chex.assert_trees_all_equal(*ends)
 
 
@@ -121,6 +127,6 @@ def test_a_task_on_the_host_is_not_run_nor_begun_in_jax():
     with pytest.raises(ValueError, match=r"is stepped on the host: see training\.host"):
         trainer.run(None, None, jnp.arange(3))
     with pytest.raises(ValueError, match="is stepped on the host: give init a start"):
-        trainer.init(jax.random.key(0), None, 0)
+        jax.eval_shape(lambda key: trainer.init(key, None, 0), jax.random.key(0))
     with pytest.raises(ValueError, match="tabular-me-ddpg puts the task on a grid"):
         training.make(ON_HOST, METHODS["tabular-me-ddpg"], SMALL, capacity=10)

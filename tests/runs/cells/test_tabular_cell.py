@@ -1,3 +1,4 @@
+import functools
 import signal
 
 import jax
@@ -60,7 +61,7 @@ def test_one_evaluation_of_the_greedy_policy_and_one_of_the_soft(result, program
         assert all(np.isnan(mean).all() for mean in found.means)
     params = env.default_params
     act = discretise.greedy(programs.mdp, result.best[1])
-    alone = evaluation.evaluate(act, env, params, 2)
+    alone = jax.jit(lambda: evaluation.evaluate(act, env, params, 2))()
     np.testing.assert_allclose(greedy.evaluation.return_mean[1], alone.return_mean, rtol=1e-5)
     assert (greedy.evaluation.return_mean != soft.evaluation.return_mean).any()
 
@@ -123,8 +124,8 @@ def test_the_number_of_demonstrations_does_not_recompile(programs):
 
 def test_a_policy_is_the_soft_optimal_one_of_its_reward(result, programs):
     mdp = programs.mdp
-    policy = tabular.soft_value_iteration(
-        mdp.dynamics, result.reward[0], discount=0.99, absorbing=mdp.absorbing
-    )
+    solve = functools.partial(tabular.soft_value_iteration, discount=0.99, absorbing=mdp.absorbing)
+    policy = jax.jit(solve)(mdp.dynamics, result.reward[0])
     np.testing.assert_allclose(policy.log_probabilities, result.best[0], rtol=1e-3, atol=1e-3)
-    assert imitation.discretised(pools.ENV, SETTINGS.tabular).states == mdp.states
+    shapes = jax.eval_shape(lambda: imitation.discretised(pools.ENV, SETTINGS.tabular))
+    assert shapes.states == mdp.states

@@ -51,8 +51,8 @@ def folder(tmp_path):
     made = compose.compose(pools.ENV.spec, METHODS["me-ddpg"], settings, 10)
     keys = jax.random.split(jax.random.key(0), SEEDS)
     trees = {
-        "policies": jax.vmap(made.agent.init)(keys).actor,
-        "rewards": jax.vmap(made.learner.init)(keys).params,
+        "policies": jax.jit(jax.vmap(made.agent.init))(keys).actor,
+        "rewards": jax.jit(jax.vmap(made.learner.init))(keys).params,
     }
     description = {"task": plain.plain(pools.ENV.spec), "settings": plain.plain(settings)}
     for method, n_demos in (("me-ddpg", 2), ("ddpg", 0)):
