@@ -42,6 +42,8 @@ def save(figure: Callable[[], Figure], files: Sequence[Path], say: Callable[[str
                 kind, buffer = path.suffix[1:], io.BytesIO()
                 metadata = {"Date": None} if kind == "svg" else {"Software": None}
                 drawn.savefig(buffer, format=kind, dpi=150, metadata=metadata)
+                # Laying out takes half of the time; every format has the first one's layout.
+                drawn.set_layout_engine("none")
                 outputs.write(path, buffer.getvalue())
     except Exception as error:
         # Drawing depends on this machine's fonts; what was measured stands without a figure, and an

@@ -96,7 +96,7 @@ class LearnedCell(NamedTuple):
             assert made.learner is not None
             learner = made.learner
             params = self._saved("rewards", _abstract(learner.init).params)
-        state = learner.init(jax.random.key(0))
+        state = jax.jit(learner.init)(jax.random.key(0))
         return Functions(
             lambda params, observation, action: learner.reward(
                 state.replace(params=params), observation, action
