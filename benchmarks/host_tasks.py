@@ -1,9 +1,10 @@
 """`python -m benchmarks.host_tasks`: where a step of a task on the host goes, and what helps.
 
 Phases: microseconds of one environment step of all learners, on one device: the simulator, its
-resets, and the compiled call that takes the updates and chooses the next actions. Rates: learning
-steps a second of DDPG, all learners together, as `run_grid` trains them, in turn: on one device, on
-every device with a thread each, and there with a process for each sub-environment.
+resets, the compiled call that takes the updates and chooses the next actions, and the same call
+before learning starts, which is all that several updates a call could spare. Rates: learning steps
+a second of DDPG, all learners together, as `run_grid` trains them, in turn: on one device, on every
+device with a thread each, and there with a process for each sub-environment.
 """
 
 import dataclasses
@@ -35,7 +36,7 @@ from cmedirl_jax.training.methods import METHODS
 from cmedirl_jax.training.settings import Settings
 
 CAPACITY = 10_000
-PHASES = ("simulator", "resets", "updates")
+PHASES = ("simulator", "resets", "updates", "without updates")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,11 +119,11 @@ def phases(name: str, options: Options) -> dict[str, float]:
     states = host_loop.begin(halves, made, vector, keys)
     spent: dict[str, float] = dict.fromkeys(map(str, PHASES), 0.0)
 
-    def timed(phase: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def timed(phase: str, function: Callable[..., Any], steps: int) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
             began = time.perf_counter()
             found = jax.block_until_ready(function(*args, **kwargs))
-            spent[phase] += 1e6 * (time.perf_counter() - began) / options.steps
+            spent[phase] += 1e6 * (time.perf_counter() - began) / steps
             return found
 
         return call
@@ -131,9 +132,12 @@ def phases(name: str, options: Options) -> dict[str, float]:
     begin = Settings().schedule.learning_starts
     end = begin + env.spec.max_episode_steps
     states, _ = host_loop.run(halves, vector, states, None, np.arange(begin, end, dtype=np.int32))
-    vector.step = timed("simulator", vector.step)
-    vector.reset = timed("resets", vector.reset)
-    halves = halves._replace(learn=timed("updates", halves.learn))
+    learn, steps = halves.learn, np.arange(min(options.steps, begin), dtype=np.int32)
+    halves = halves._replace(learn=timed("without updates", learn, len(steps)))
+    states, _ = host_loop.run(halves, vector, states, None, steps)
+    vector.step = timed("simulator", vector.step, options.steps)
+    vector.reset = timed("resets", vector.reset, options.steps)
+    halves = halves._replace(learn=timed("updates", learn, options.steps))
     numbers = np.arange(end, end + options.steps, dtype=np.int32)
     host_loop.run(halves, vector, states, None, numbers)
     return spent

@@ -85,8 +85,8 @@ class RunConfig:
         out: Folder of the results.
         asynchronous: Step each learner's copy of a task of Gymnasium's in a process of its own,
             for slow tasks.
-        devices: CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU.
-            With several processes, of each of them.
+        devices: CPU devices, or GPUs, to spread the seeds over; default: every core, or every GPU,
+            and for a task on the host a core for each 32 seeds. With several processes, of each.
         group: Seeds that a device steps together; default: what is fastest for the networks' width.
         checkpoint_every: Seconds from one checkpoint of the training to the next; 0: one after
             every chunk.

@@ -6,6 +6,7 @@ from pathlib import Path
 from rich.console import Console
 
 from cmedirl_jax.envs import Env
+from cmedirl_jax.envs.registry import ENVS
 from cmedirl_jax.runs import run as run_lib
 from cmedirl_jax.runs import start, validation
 from cmedirl_jax.runs.cells import pools
@@ -21,6 +22,8 @@ _STOPPING = "Stopping after this chunk of steps; once more to stop at once\n"
 _CONTINUE = "start the same command again to go on"
 _OF_A_PROCESS = ("out", "coordinator", "process_id")
 """The options in which the processes of one run may differ."""
+_FEWEST_ON_HOST = 32
+"""Learners of a task on the host from which a further device pays (docs/performance.md)."""
 
 
 def execute(
@@ -47,7 +50,8 @@ def execute(
         return exit_code
 
     try:
-        cluster, devices = start.start(config.cluster, config.devices, config.seeds, same)
+        fewest = 4 if config.env in ENVS else _FEWEST_ON_HOST
+        cluster, devices = start.start(config.cluster, config.devices, config.seeds, same, fewest)
         console.quiet = not cluster.writer
         with signals.noted(None if console.quiet else _STOPPING, cluster) as interruption:
             plan = validation.plan(config, cluster, fewer_will_do=fewer_will_do)

@@ -18,7 +18,7 @@ _M_ARENA_MAX = -8
 
 
 def start(
-    options: ClusterOptions, count: int | None, seeds: int, same: dict[str, Any]
+    options: ClusterOptions, count: int | None, seeds: int, same: dict[str, Any], fewest: int = 4
 ) -> tuple[Cluster, list[Any]]:
     """Start JAX with as many CPU devices as the run uses, or take the GPUs there are.
 
@@ -29,6 +29,8 @@ def start(
         count: devices of each process; None: every core or GPU that is of use.
         seeds: how many seeds share the devices.
         same: options that must be equal on all processes, JSON values; so must `numerics` be.
+        fewest: seeds below which a further core is of no use; fewer than four a device do not fill
+            a vector unit.
 
     Returns:
         The processes, and the devices of all of them.
@@ -38,8 +40,7 @@ def start(
             processes do not agree.
     """
     share_heap(arenas=cores())
-    # A device wants a few seeds to itself: fewer than four a device do not fill a vector unit.
-    wanted = count or max(1, min(cores(), seeds // 4))
+    wanted = count or max(1, min(cores(), seeds // fewest))
     if count is None or 1 <= count <= cores():
         # In a second call within one process JAX keeps the devices that it has.
         with contextlib.suppress(RuntimeError):
