@@ -1,4 +1,4 @@
-"""`python -m benchmarks.main_job`: how long the main job takes, phase by phase.
+"""`python -m benchmarks.main_job`: how long the main job takes, phase by phase, and its memory.
 
 The main job is `run_grid` with its defaults. It runs in a process of its own, on every core. Its
 wall time T is compared with a yardstick: a program that takes the same DDPG learning steps on one
@@ -85,7 +85,7 @@ def learning_steps(folder: Path, *, trains_experts: bool) -> int:
 
 
 def run(job: Sequence[str], cache: str, yardstick: str | None) -> dict[str, Any]:
-    """Run the job in a process of its own; its seconds, in all and by phase, and its rates.
+    """Run the job in a process of its own; its seconds, in all and by phase, rates and memory.
 
     Raises:
         UserError: with the end of what it wrote, if it fails; as `yardstick_rate`.
@@ -103,13 +103,14 @@ def run(job: Sequence[str], cache: str, yardstick: str | None) -> dict[str, Any]
         seconds = time.perf_counter() - began
         if done.returncode:
             raise UserError(f"--job: the run failed: {done.stderr[-500:]}")
-        spent = json.loads(answer.read_text())
+        spent, peak = json.loads(answer.read_text()).values()
         steps = learning_steps(out, trains_experts=run_grid.parse(job).demos is None)
     spent["rest"] = seconds - sum(spent.values())
     result = {
         "seconds": seconds,
         "learning_steps": steps,
         "phases": spent,
+        "peak_memory_bytes": peak,
         "training_steps_per_second": steps / spent["training"],
     }
     if before is not None:
@@ -122,12 +123,14 @@ def run(job: Sequence[str], cache: str, yardstick: str | None) -> dict[str, Any]
 def work() -> None:
     """Be the job's process: `run_grid` with the command line's arguments after the first.
 
-    The first is the file for its seconds by phase.
+    The first is the file for its seconds by phase and its memory.
     """
     answer, *job = sys.argv[1:]
     with phases.counted() as spent, compile_cache.counted() as cost:
         code = run_grid.main(job)
-    measuring.write({**spent, "compilation": cost.seconds}, Path(answer))
+    seconds = {**spent, "compilation": cost.seconds}
+    measured = {"phases": seconds, "peak_memory_bytes": serving.peak_memory()}
+    measuring.write(measured, Path(answer))
     sys.exit(code)
 
 
@@ -150,7 +153,7 @@ def yardstick_rate(command: str | None) -> float | None:
 
 
 def table(runs: dict[str, list[dict[str, Any]]]) -> Table:
-    """Medians over the rounds: a row for each phase, the rest, all of it, and the rates."""
+    """Medians over the rounds: a row for each phase, the rest, all of it, rates and memory."""
     shown = Table(box=box.SIMPLE, title="the main job, seconds")
     shown.add_column("phase")
     for kind in runs:
@@ -165,6 +168,8 @@ def table(runs: dict[str, list[dict[str, Any]]]) -> Table:
         row(name, "{:.1f}", lambda run, name=name: run["phases"].get(name, 0.0))
     row("all", "{:.1f}", lambda run: run["seconds"])
     row("learning steps/s while training", "{:,.0f}", lambda run: run["training_steps_per_second"])
+    if first["peak_memory_bytes"] is not None:
+        row("peak memory, MB", "{:,.0f}", lambda run: run["peak_memory_bytes"] / 1e6)
     if "seconds_by_yardstick" in first:
         row("T R / N", "{:.2f}", lambda run: run["seconds_by_yardstick"])
     return shown

@@ -65,7 +65,7 @@ def serve(advance: Callable[[int], Any], steps: int, facts: Callable[[], dict] =
             found = advance(int(line))
             seconds = time.perf_counter() - began
             fields = found if isinstance(found, dict) else {}
-            answer({"seconds": seconds, "peak_memory_bytes": _peak(), **fields})
+            answer({"seconds": seconds, "peak_memory_bytes": peak_memory(), **fields})
 
 
 def serve_from_command_line(
@@ -139,7 +139,8 @@ class Worker:
         raise RuntimeError(self._errors.read()[-2000:])
 
 
-def _peak() -> int | None:
+def peak_memory() -> int | None:
+    """Bytes that this process has held at most; None where the system does not say."""
     # On Linux, getrusage includes the peak of the parent that the process was forked from.
     if sys.platform == "linux":
         with open("/proc/self/status") as status:
