@@ -103,7 +103,8 @@ def run(job: Sequence[str], cache: str, yardstick: str | None) -> dict[str, Any]
         seconds = time.perf_counter() - began
         if done.returncode:
             raise UserError(f"--job: the run failed: {done.stderr[-500:]}")
-        spent, peak = json.loads(answer.read_text()).values()
+        found = json.loads(answer.read_text())
+        spent, peak = found["phases"], found["peak_memory_bytes"]
         steps = learning_steps(out, trains_experts=run_grid.parse(job).demos is None)
     spent["rest"] = seconds - sum(spent.values())
     result = {

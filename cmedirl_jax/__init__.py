@@ -9,7 +9,8 @@ Learn a reward from demonstrations, and train on it:
     method = cm.METHODS["hs-me-ddpg"]
     result = cm.training.fit(key, env, method, pool, seeds=8, steps=12_000)
 
-Everything is a pure function over pytrees: the caller owns jit, vmap, donation and sharding.
+Training in JAX is pure functions over pytrees: the caller owns jit, vmap, donation and sharding.
+Tasks of Gymnasium, which are stepped on the host, compile for themselves (`training.host`).
 
 Tasks and data
     envs: environments by name, their interface, and your own.

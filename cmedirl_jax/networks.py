@@ -51,8 +51,8 @@ class Architecture:
         critic_normalisation: Normalisation of the critic's hidden layers, before each ReLU.
         normalise_observation: At the input of each network, the reward's too. bounds: map them to
             [-1, 1] where they are sensible, elsewhere take off the mean of the demonstrations'
-            observations (of one's own so far, where there are none) and divide by their standard
-            deviation; statistics: do this everywhere; none.
+            observations (without demonstrations, of the learner's own so far) and divide by their
+            standard deviation; statistics: do this everywhere; none.
         action_layer: Index of the critic's layer at which the action joins (0: the input;
             Lillicrap et al.: 1).
         output_scale: Half-width of the uniform initialisation of the last layer's parameters.
@@ -124,7 +124,11 @@ def actor(spec: EnvSpec, architecture: Architecture) -> Network:
 
 
 def critic(spec: EnvSpec, architecture: Architecture) -> Network:
-    """An action-value function: observation `[..., O]`, action `[..., A]` -> value `[...]`."""
+    """An action-value function: observation `[..., O]`, action `[..., A]` -> value `[...]`.
+
+    Raises:
+        ValueError: if there is no layer number `action_layer`.
+    """
     if not 0 <= architecture.action_layer <= len(architecture.hidden):
         raise ValueError(
             f"action_layer must be between 0 and {len(architecture.hidden)}, the number of hidden "
@@ -175,6 +179,8 @@ def imitation_error(
     counts: jax.Array | None = None,
 ) -> tuple[jax.Array, Params]:
     """Mean squared error of mu(s) to demonstrated actions, in training mode, and the parameters.
+
+    The mean is over pairs and dimensions of the action.
 
     Args:
         networks: the actor and the squashing.

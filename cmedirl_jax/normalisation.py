@@ -116,7 +116,7 @@ def by_bounds(spec: EnvSpec) -> Callable[[jax.Array], jax.Array]:
 
 
 def units(spec: EnvSpec, params: Params) -> jax.Array:
-    """`[O]`, the size of an observation: half its range, else the deviation that `params` keep."""
+    """`[O]`, the size of an observation: half its range, else the deviation in `params`, else 1."""
     made = make(spec, "bounds")
     if not made.has_statistics or STATISTICS not in params:
         return jnp.asarray(made.half_width)

@@ -19,11 +19,11 @@ STATISTICS = "observation_statistics"
 FIXED = (STATISTICS, "batch_stats")
 """Names of parameters that no optimiser moves."""
 LEAST_STD = 1e-4
-"""Of constant observations, as a share of their magnitude or of 1."""
+"""A deviation up to this share of max(|mean|, 1) is rounding: 1 takes its place."""
 
 
 class Statistics(NamedTuple):
-    """Of observations.
+    """Mean and standard deviation of observations.
 
     Attributes:
         mean: `[O]`.

@@ -321,9 +321,9 @@ def _move_targets(state: DDPGState) -> DDPGState:
 
 
 def td_targets(networks: ActorCritic, state: DDPGState, batch: Transition) -> jax.Array:
-    """y = r + gamma (1 - terminated) Q'(s', mu'(s')), `[B]`.
+    """y = reward_scale r + gamma (1 - terminated) Q'(s', mu'(s')), `[B]`.
 
-    Algorithm 2 prints it without (1 - terminated), which DDPG (Lillicrap et al. 2015) has.
+    Algorithm 2 prints it without (1 - terminated), as with `hparams.bootstrap_at_termination`.
     """
     next_action = networks_lib.policy(networks, state.target_actor, batch.next_observation)
     next_value = networks.critic.apply(state.target_critic, batch.next_observation, next_action)
@@ -372,7 +372,7 @@ def behaviour_cloning_loss(
     hparams: DDPGHParams,
     demonstrations: Transition,
 ) -> jax.Array:
-    """w 1/D sum_i |mu(s_i) - a_i|^2 on demonstrations `[D, ...]`, added to the actor's loss.
+    """w / (D A) sum_i |mu(s_i) - a_i|^2 on demonstrations `[D, ...]`, added to the actor's loss.
 
     `w` is `hparams.behaviour_cloning`. With `hparams.q_filter` each term is multiplied by
     1{Q(s_i, a_i) > Q(s_i, mu(s_i))} (Nair et al. 2018).

@@ -256,10 +256,10 @@ def _check_ornstein_uhlenbeck(
 
 
 class HeldActionState(flax.struct.PyTreeNode):
-    """The random action that is held.
+    """The last action, and how long it is still held.
 
     Attributes:
-        action: `[A]`, the last action.
+        action: `[A]`, the last action, random or greedy.
         remaining: `[]`, environment steps for which it is held further.
         hparams: the hyperparameters.
     """
@@ -338,8 +338,8 @@ def _perturb_epsilon_greedy(
         densities.epsilon_greedy(spec, epsilon, action, chosen, scale),
     )
     remaining = jnp.where(begins, state.hparams.hold - 1.0, state.remaining - 1.0)
-    held = chosen.astype(state.action.dtype)
-    state = state.replace(action=held, remaining=jnp.maximum(remaining, 0.0))
+    last = chosen.astype(state.action.dtype)
+    state = state.replace(action=last, remaining=jnp.maximum(remaining, 0.0))
     return chosen, log_density, state
 
 

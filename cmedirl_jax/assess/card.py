@@ -160,11 +160,11 @@ def on_grid(rewards: Rewards, mdp: FiniteMDP, discount: Numeric) -> OnGrid:
         jnp.asarray(interpolation.points(grid)) for grid in (mdp.states, mdp.actions)
     )
     pairs = jnp.broadcast_to(states[:, None], (len(states), len(actions), states.shape[1]))
-    done = jnp.broadcast_to(actions[None], (len(states), *actions.shape))
+    every_action = jnp.broadcast_to(actions[None], (len(states), *actions.shape))
 
     def table(params: Any) -> jax.Array:
         # The absorbing state pays nothing.
-        return jnp.pad(rewards.reward(params, pairs, done), ((0, 1), (0, 0)))
+        return jnp.pad(rewards.reward(params, pairs, every_action), ((0, 1), (0, 0)))
 
     tables = jax.lax.map(table, rewards.params)
     forms = distances.starc(mdp.dynamics, jnp.concatenate([mdp.reward[None], tables]), discount)
@@ -201,9 +201,9 @@ def told(rewards: Rewards, demonstrated: Transition, played: Transition) -> Told
         played: leaves `[R, M, ...]`.
     """
 
-    def one(params: Any, shown: Transition, done: Transition) -> Told:
+    def one(params: Any, shown: Transition, acted: Transition) -> Told:
         ours, theirs = (
-            rewards.reward(params, each.observation, each.action) for each in (shown, done)
+            rewards.reward(params, each.observation, each.action) for each in (shown, acted)
         )
         both = jnp.concatenate([ours, theirs])
         return Told(occupancy.area_under_roc(ours, theirs), jnp.max(both), jnp.min(both))

@@ -7,8 +7,9 @@ from cmedirl_jax.types import Array
 
 
 def maximum_mean_discrepancy(ours: Array, theirs: Array) -> jax.Array:
-    """The maximum mean discrepancy of two samples, unbiased, `[]` (Gretton et al. 2012).
+    """The maximum mean discrepancy of two samples, `[]` (Gretton et al. 2012).
 
+    The root of the unbiased estimate of its square,
     sqrt(max(0, E[k(x, x')] + E[k(y, y')] - 2 E[k(x, y)])) with a Gaussian kernel whose width is the
     median distance of the pooled points.
 

@@ -68,7 +68,7 @@ def retrain(
     """
     budget = {"steps": steps, "evaluate_every": evaluate_every}
     budget["evaluation_starts"] = evaluation_starts
-    task = prepare(env.spec, "ddpg", None, None, settings, seeds=keys.shape[0], **budget)
+    prepared = prepare(env.spec, "ddpg", None, None, settings, seeds=keys.shape[0], **budget)
     if physics is None:
         physics = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], env.default_params)
     paying = env if rewards is None else with_reward(env, rewards.reward)
@@ -77,7 +77,9 @@ def retrain(
         params = learner.physics
         if rewards is not None:
             params = PayingParams(params, learner.reward)
-        made = trainer.make(paying, task.method, task.settings, capacity=steps, env_params=params)
+        made = trainer.make(
+            paying, prepared.method, prepared.settings, capacity=steps, env_params=params
+        )
         state = made.init(learner.key, None, 0)
         return learn_and_evaluate(made, state, None, env, learner.physics, **budget).evaluations
 
@@ -86,7 +88,7 @@ def retrain(
     # A task may have no parameters.
     worlds = leaves[0].shape[0] if leaves else 1
     count = keys.shape[0] * worlds
-    group = seeds_lib.group_size(count, hidden=task.settings.architecture.hidden)
+    group = seeds_lib.group_size(count, hidden=prepared.settings.architecture.hidden)
     which = jnp.arange(seeds_lib.padded(count, group)) % count
     agent, world = which // worlds, which % worlds
     learners = _Learner(

@@ -23,7 +23,7 @@ from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import outputs
 
 MILLISECONDS = 40
-"""That a frame is shown."""
+"""How long each frame is shown."""
 
 
 @dataclasses.dataclass(frozen=True)

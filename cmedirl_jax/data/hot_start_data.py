@@ -1,4 +1,4 @@
-"""Demonstrations as hot starts and tabular fits read them: arrays that go through `jit`."""
+"""Demonstrations as arrays that go through `jit`, for every method that uses them."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ class HotStartData(NamedTuple):
     Attributes:
         transition: leaves `[N, ...]`.
         discounted_return: `[N]` float32, the discounted return from each step to the end of its
-            episode.
+            episode, times the agent's reward scale.
         episodes: where the pool's episodes lie.
     """
 

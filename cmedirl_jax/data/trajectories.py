@@ -1,7 +1,7 @@
 """From trajectories, whatever they lack, to a pool of demonstrations.
 
     pool = demonstrations.from_trajectories(
-        [dict(observations=seen, actions=done, rewards=paid, terminated=True), ...],
+        [dict(observations=seen, actions=actions, rewards=rewards, terminated=True), ...],
         env="Pendulum-v1",
     )
 

@@ -36,7 +36,10 @@ make_one.metadata = Drawing.metadata  # type: ignore[attr-defined]
 def make_vector(
     *, task: str, num_envs: int, max_episode_steps: int | None, **kwargs: Any
 ) -> VectorEnv[np.ndarray, np.ndarray, np.ndarray]:
-    """Make a registered task many times over, without a limit for -1; see `to_gymnasium_vector`."""
+    """Make a registered task many times over, for None or -1 without a limit.
+
+    See `to_gymnasium_vector`.
+    """
     env = make(task)
     limit = _NO_LIMIT if max_episode_steps in (None, -1) else max_episode_steps
     params = env.default_params.replace(max_episode_steps=limit)

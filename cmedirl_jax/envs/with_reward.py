@@ -21,8 +21,8 @@ class PayingParams(NamedTuple):
     """Parameters of a task that pays another reward.
 
     Attributes:
-        env: of the task.
-        reward: of the reward.
+        env: the task's own.
+        reward: the reward's.
     """
 
     env: Any
@@ -30,7 +30,7 @@ class PayingParams(NamedTuple):
 
 
 class PayingState(NamedTuple):
-    """A state of it.
+    """A state of a task that pays another reward.
 
     Attributes:
         env: the task's state.

@@ -77,8 +77,9 @@ class RewardLearner(NamedTuple):
 
     Attributes:
         init: `(key) -> RewardState`.
-        reward: `(state, observation [..., O], action [..., A]) -> [...]`, r_D(s, a; theta). It
-            raises ValueError for wrong shapes and TypeError for wrong dtypes, while tracing.
+        reward: `(state, observation [..., O], action [..., A]) -> [...]`, r_D(s, a; theta). That of
+            a network raises ValueError for wrong shapes and TypeError for wrong dtypes, while
+            tracing.
         update: see `UpdateFn`.
         absorbing: `(state) -> []`, r_D of the absorbing state that follows termination; None if
             there is no such state.

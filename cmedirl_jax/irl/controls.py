@@ -26,8 +26,8 @@ class ControlSettings:
 
     Attributes:
         random_share: Bound of a random reward, as a share of reward.bound. It sets the reward's
-            standard deviation; over the replay of `tuned` that is a learned reward's at the default
-            (columns r_d_std of evaluations.parquet).
+            standard deviation: at the default that of a learned reward over the replay of `tuned`
+            (column r_d_std of evaluations.parquet).
     """
 
     random_share: Positive = 0.64
@@ -83,8 +83,8 @@ def random(
         network: default `rewards.mlp(spec)`. Its first parameters have to make it vary.
 
     Raises:
-        ValueError: if the specification contradicts itself, or the bound of the reward is out of
-            range.
+        ValueError: if the specification contradicts itself, or the bound of the reward or `share`
+            is out of range.
     """
     checks.env_spec(spec)
     hparams = hparams or IRLHParams()

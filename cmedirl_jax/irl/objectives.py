@@ -1,8 +1,9 @@
 """The data term of the log-likelihood, L_D, estimated from samples.
 
-The derivative of each objective by the rewards is mu_D - E[mu] (Eqs. 6 and 8), both undiscounted
-and with sum one: the frequencies in the batch of demonstrations, minus those among weighted
-samples. The objectives differ in the weights `w`:
+The derivative of each objective by a sample's `Scored.reward` (r of a pair, R of a trajectory) is
+the sample's frequency among the demonstrations minus its weight among the samples. Each sums to
+one, and the difference estimates mu_D - E[mu] (Eqs. 6 and 8). The objectives differ in the weights
+`w`:
 
 - `visitation`: w ~ z. The plain difference of two means. It is linear in the reward and does not
   bound it.

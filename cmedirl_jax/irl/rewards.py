@@ -159,7 +159,7 @@ def radial_basis(spec: EnvSpec, centres: int, inputs: Inputs = "state-action") -
     of the action whose coefficients vary over the states.
 
     Raises:
-        ValueError: if there are fewer than two centres, the observation has an infinite bound, or
+        ValueError: if there are fewer than two centres, the observation has a bound beyond 1e6, or
             the grid, or later the features of a batch, are above `checks.LARGEST_ARRAY`.
     """
     checks.env_spec(spec)
@@ -204,7 +204,7 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
     the `d` inputs scaled to [0, 1]: the observation, and then the action.
 
     Raises:
-        ValueError: if the order is less than one, an input has an infinite bound, or the
+        ValueError: if the order is less than one, an input has a bound beyond 1e6, or the
             frequencies, or later the features of a batch, are above `checks.LARGEST_ARRAY`.
     """
     checks.env_spec(spec)

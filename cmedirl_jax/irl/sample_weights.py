@@ -74,7 +74,7 @@ class RecordedState(flax.struct.PyTreeNode):
 
 
 def recorded(spec: EnvSpec, source: SampleSource, replay_capacity: int) -> SampleWeights:
-    """The density that was recorded when the action was drawn."""
+    """The density that was recorded when the action was drawn; demonstrations have a fitted one."""
     return SampleWeights(
         init=functools.partial(_init_recorded, spec=spec, replay_capacity=replay_capacity),
         record=functools.partial(_record_density, replay_capacity=replay_capacity),

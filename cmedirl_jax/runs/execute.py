@@ -22,8 +22,6 @@ _STOPPING = "Stopping after this chunk of steps; once more to stop at once\n"
 _CONTINUE = "start the same command again to go on"
 _OF_A_PROCESS = ("out", "coordinator", "process_id")
 """The options in which the processes of one run may differ."""
-_FEWEST_ON_HOST = 32
-"""Learners of a task on the host from which a further device pays (docs/performance.md)."""
 
 
 def execute(
@@ -50,7 +48,7 @@ def execute(
         return exit_code
 
     try:
-        fewest = 4 if config.env in ENVS else _FEWEST_ON_HOST
+        fewest = start.FEWEST if config.env in ENVS else start.FEWEST_ON_HOST
         cluster, devices = start.start(config.cluster, config.devices, config.seeds, same, fewest)
         console.quiet = not cluster.writer
         with signals.noted(None if console.quiet else _STOPPING, cluster) as interruption:

@@ -15,10 +15,18 @@ from cmedirl_jax.runs.errors import UserError
 
 _M_ARENA_MAX = -8
 """`malloc.h`; see mallopt(3)."""
+FEWEST = 4
+"""Seeds below which a further core is of no use: fewer do not fill a vector unit."""
+FEWEST_ON_HOST = 32
+"""The same for a task on the host (docs/performance.md)."""
 
 
 def start(
-    options: ClusterOptions, count: int | None, seeds: int, same: dict[str, Any], fewest: int = 4
+    options: ClusterOptions,
+    count: int | None,
+    seeds: int,
+    same: dict[str, Any],
+    fewest: int = FEWEST,
 ) -> tuple[Cluster, list[Any]]:
     """Start JAX with as many CPU devices as the run uses, or take the GPUs there are.
 
@@ -29,8 +37,7 @@ def start(
         count: devices of each process; None: every core or GPU that is of use.
         seeds: how many seeds share the devices.
         same: options that must be equal on all processes, JSON values; so must `numerics` be.
-        fewest: seeds below which a further core is of no use; fewer than four a device do not fill
-            a vector unit.
+        fewest: seeds for each of several cores.
 
     Returns:
         The processes, and the devices of all of them.

@@ -65,7 +65,7 @@ def make(
             over the cell around its point; 1 takes the point itself.
 
     Raises:
-        ValueError: if the environment has no `state_at`, an infinite bound, or other dimensions,
+        ValueError: if the environment has no `state_at`, a bound beyond 1e6, or other dimensions,
             or the dynamics are above `checks.LARGEST_ARRAY`.
     """
     if env.state_at is None:

@@ -39,7 +39,7 @@ def value_iteration(
 ) -> OptimalPolicy:
     """V*(s) = max_a r(s, a) + gamma sum_s' P(s'|s,a) V*(s').
 
-    The arguments are those of `soft_value_iteration`.
+    The arguments are those of `soft_value_iteration`, without a temperature and a first guess.
 
     Raises:
         ValueError: if the shapes do not fit each other, the horizon is below 1, or a value that is

@@ -13,12 +13,12 @@ from cmedirl_jax.envs import Env, playing
 
 
 class Rollouts(NamedTuple):
-    """`B` finished episodes.
+    """`B` finished episodes; those of `rollout_on_host` are `[n, E]`.
 
     Attributes:
         episode_return: `[B]`, undiscounted, of the environment's own reward.
         length: `[B]` int32.
-        terminated: `[B]` bool; for a goal-reaching task, whether the goal was reached.
+        terminated: `[B]` bool, whether the task itself ended it: a goal, or a fall.
     """
 
     episode_return: Any
@@ -32,7 +32,7 @@ class Evaluation(NamedTuple):
     Attributes:
         return_mean: mean undiscounted return.
         return_std: standard deviation of the return over the starts.
-        goal_fraction: share of the episodes that terminated before the time limit.
+        goal_fraction: share of the episodes that the task itself ended, at a goal or otherwise.
         length_mean: mean episode length.
     """
 

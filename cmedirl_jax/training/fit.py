@@ -120,7 +120,7 @@ def fit(
     """
     if isinstance(env, HostEnv):
         raise ValueError(f"{env.spec.id} is stepped on the host: use training.host.fit")
-    task = prepare(
+    prepared = prepare(
         env.spec,
         method,
         demonstrations,
@@ -131,14 +131,14 @@ def fit(
         evaluate_every=evaluate_every,
         evaluation_starts=evaluation_starts,
     )
-    trainer = make(env, task.method, task.settings, capacity=steps)
+    trainer = make(env, prepared.method, prepared.settings, capacity=steps)
 
     def learn(key: jax.Array) -> Result:
-        state = trainer.init(key, task.data, task.n_demonstrations)
+        state = trainer.init(key, prepared.data, prepared.n_demonstrations)
         return learn_and_evaluate(
             trainer,
             state,
-            task.data,
+            prepared.data,
             env,
             env.default_params,
             steps=steps,
@@ -146,7 +146,7 @@ def fit(
             evaluation_starts=evaluation_starts,
         )
 
-    group = seeds_lib.group_size(seeds, hidden=task.settings.architecture.hidden)
+    group = seeds_lib.group_size(seeds, hidden=prepared.settings.architecture.hidden)
     keys = seeds_lib.keys(key, seeds_lib.padded(seeds, group))
     result = seeds_lib.map_groups(learn, group)(keys)
     return jax.tree.map(lambda x: x[:seeds], result)

@@ -41,7 +41,7 @@ def fit(
     The evaluation starts are those of the reset seeds 0, 1, ...
 
     Args:
-        key: as there, and likewise the others.
+        key: seed i learns from `fold_in(key, i)`.
         env: the task.
         method: a `Method`, or the name of one of `METHODS`.
         demonstrations: the pool, for methods that use one.
@@ -53,9 +53,10 @@ def fit(
         evaluation_starts: start states per evaluation.
 
     Raises:
-        ValueError: as `training.fit`; and for a method with a tabular reward.
+        ValueError: as `training.fit`, whose task is one in JAX; and for a method with a tabular
+            reward.
     """
-    task = prepare(
+    prepared = prepare(
         env.spec,
         method,
         demonstrations,
@@ -66,7 +67,7 @@ def fit(
         evaluate_every=evaluate_every,
         evaluation_starts=evaluation_starts,
     )
-    trainer = make(env, task.method, task.settings, capacity=steps)
+    trainer = make(env, prepared.method, prepared.settings, capacity=steps)
     halves = host_loop.compile_halves(trainer, env.spec.max_episode_steps)
     act = jax.jit(jax.vmap(trainer.act))
     summarise = jax.jit(jax.vmap(evaluation.summarise))
@@ -86,10 +87,12 @@ def fit(
             )
 
         keys = seeds_lib.keys(key, seeds)
-        states = host_loop.begin(halves, trainer, vector, keys, task.data, task.n_demonstrations)
+        states = host_loop.begin(
+            halves, trainer, vector, keys, prepared.data, prepared.n_demonstrations
+        )
         evaluations, logs = [evaluate(states)], []
         for chunk in np.arange(steps, dtype=np.int32).reshape(-1, evaluate_every):
-            states, log = host_loop.run(halves, vector, states, task.data, chunk)
+            states, log = host_loop.run(halves, vector, states, prepared.data, chunk)
             evaluations.append(evaluate(states))
             logs.append(log)
     return Result(

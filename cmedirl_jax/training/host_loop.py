@@ -52,7 +52,7 @@ def compile_halves(trainer: Trainer, max_episode_steps: int) -> Halves:
     """Jit a trainer's halves of a step over seeds; they run on the device where the states are."""
 
     def spread(function: Callable[..., Any]) -> Callable[..., Any]:
-        """`function(seed, *shared)` over seeds."""
+        """`function(inputs of a seed, *shared)` over seeds."""
 
         def mapped(of_seeds: Any, *shared: Any) -> Any:
             in_axes = (0, *(None for _ in shared))
@@ -65,12 +65,12 @@ def compile_halves(trainer: Trainer, max_episode_steps: int) -> Halves:
         return trainer.behave(state, draws, trainer.plan(step))
 
     def learn(
-        seed: tuple[TrainingState, Behaviour, Step, jax.Array],
+        inputs: tuple[TrainingState, Behaviour, Step, jax.Array],
         step: jax.Array,
         pool: Transition | None,
         max_episodes: Numeric | None,
     ) -> tuple[TrainingState, Log, Behaviour]:
-        state, behaviour, answer, next_start = seed
+        state, behaviour, answer, next_start = inputs
         plan = trainer.plan(step)
         demonstrated = plan.learn_reward | (plan.cloning_weight > 0.0)
         draws = trainer.draw(state.key, state.subset, step, demonstrated)
@@ -79,15 +79,15 @@ def compile_halves(trainer: Trainer, max_episode_steps: int) -> Halves:
         )
         return state, log, behave(state, step + 1)
 
-    def first_seed(key: jax.Array) -> jax.Array:
+    def first_reset_seed(key: jax.Array) -> jax.Array:
         keys, _ = initialise.split(jax.random.clone(key))
         return jax.random.bits(keys.env, dtype=jnp.uint32)
 
-    def seed(state: TrainingState, step: jax.Array) -> jax.Array:
+    def reset_seed(state: TrainingState, step: jax.Array) -> jax.Array:
         return jax.random.bits(step_lib.step_keys(state.key, step)[1], dtype=jnp.uint32)
 
-    def begin_episode(seed: tuple[TrainingState, jax.Array], step: jax.Array) -> TrainingState:
-        return _begin_episode(trainer, *seed, step)
+    def begin_episode(inputs: tuple[TrainingState, jax.Array], step: jax.Array) -> TrainingState:
+        return _begin_episode(trainer, *inputs, step)
 
     learn_all = spread(learn)
     return Halves(
@@ -96,8 +96,8 @@ def compile_halves(trainer: Trainer, max_episode_steps: int) -> Halves:
             lambda states, answered, *shared: learn_all((states, *answered), *shared),
             donate_argnums=0,
         ),
-        first_seeds=jax.jit(spread(first_seed)),
-        seeds=jax.jit(spread(seed)),
+        first_seeds=jax.jit(spread(first_reset_seed)),
+        seeds=jax.jit(spread(reset_seed)),
         begin_episode=jax.jit(spread(begin_episode)),
         max_episode_steps=max_episode_steps,
     )

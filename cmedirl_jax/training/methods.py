@@ -18,8 +18,8 @@ class Method(NamedTuple):
             `schedule.cloning` the actor also goes on imitating them, for a while or throughout.
         reward: where r_D comes from, a name in `REWARDS`; None for a method without.
         shaping: how r_D joins r_e, unless the settings say otherwise.
-        interacts: whether DDPG learns in the environment; if not, the method's policy is that of
-            its hot start, or the soft-optimal one of the tabular reward.
+        interacts: whether DDPG learns in the environment; if not, the method's policy is its
+            hot-started actor, or the likeliest action of the tabular reward's soft-optimal policy.
         label: of its curve in figures; None: its name.
     """
 

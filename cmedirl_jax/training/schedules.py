@@ -81,7 +81,7 @@ class Plan(NamedTuple):
         update_targets: move the targets at that update.
         learn_reward: update the learned reward.
         reward_weight: weight of r_D beside r_e.
-        cloning_weight: factor on the behaviour-cloning term; 0 where there is none.
+        cloning_weight: factor on a hot-started method's cloning term; other methods have none.
     """
 
     step: jax.Array

@@ -1,6 +1,6 @@
 """One environment step of Algorithm 2 in phases: act, learn the reward, learn the agent, log.
 
-Every function takes the method's `StepParts` first; `trainer` binds them.
+The functions that need the method's parts take `StepParts` first; `trainer` binds them.
 """
 
 import functools
@@ -29,7 +29,7 @@ class Log(NamedTuple):
 
     Attributes:
         done: an episode ended at this step (and the seed was still running).
-        terminated: it ended at the goal rather than by the time limit.
+        terminated: the task itself ended the episode at this step: a goal, or a fall.
         episode_return: undiscounted return of the episode so far, the environment's reward alone.
         episode_length: steps of the episode so far.
         learned: actor and critic were updated at this step.
@@ -217,13 +217,15 @@ def _store_shaped(
 ) -> tuple[ReplayState, Added]:
     """Write r* over the r_e that was just stored; Algorithm 2 learns the reward first."""
     discount = state.agent.hparams.discount
-    shaped = updates.shape(parts.updates, reward, transition, discount, plan.reward_weight)
+    shaped = updates.with_shaped_reward(
+        parts.updates, reward, transition, discount, plan.reward_weight
+    )
     replay_state = parts.algorithm.replay.add(ReplayState(replay_state.storage, plan.step), shaped)
     return replay_state, updates.added(parts.updates, transition, shaped)
 
 
 class _Losses(NamedTuple):
-    """Of an update of the agent: fields of `Log`."""
+    """Diagnostics of one update of the agent, as `Log` has them."""
 
     critic_loss: jax.Array
     q_mean: jax.Array
@@ -263,7 +265,7 @@ def _move_statistics(
 ) -> tuple[DDPGState, RewardState | None, observation_statistics.Running | None]:
     """Add the new observations to the running statistics, and give them to every network.
 
-    So does a random reward normalise, whose weights stay.
+    A random reward normalises by them too, though its weights never change.
     """
     running = state.observation_statistics
     if running is None:

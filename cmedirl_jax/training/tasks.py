@@ -57,7 +57,7 @@ def of(task: str) -> TaskSettings:
 
 
 def found(task: str) -> TaskSettings | None:
-    """The same; None for a task without. Imports its module, which may add them."""
+    """The entry of `TASKS` for a task, or None. Imports the task's module, which may add one."""
     module, name = split_id(task)
     if module:
         # What is wrong with the module is said where the task is made.

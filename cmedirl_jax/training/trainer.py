@@ -85,7 +85,8 @@ def make(
     """Make a trainer.
 
     Args:
-        env: the environment. One that is stepped on the host has no `run`: see `training.host`.
+        env: the environment. For one that is stepped on the host `run` raises ValueError: see
+            `training.host`.
         method: one of `METHODS`, or your own.
         settings: every other choice.
         capacity: transitions in the replay where `settings.schedule` leaves it open.

@@ -1,6 +1,6 @@
 """What a step learns from the replay and the demonstrations: the inner lines of Algorithm 2.
 
-Every function takes the method's `UpdateParts` first; `step` binds them.
+The functions that need the method's parts take `UpdateParts` first.
 """
 
 from collections.abc import Callable
@@ -109,6 +109,7 @@ def draw(
     be drawn for that.
     """
     replay, sampler = parts.algorithm.replay, parts.algorithm.sampler
+    # Key i of a split is `fold_in(key, i)`: what is folded in below begins at 3.
     batch_key, background_key, demonstrations_key = jax.random.split(key, 3)
     # Rows of the pool, shared by behaviour cloning and a reward that learns from pairs.
     cloned = 0 if parts.cloning == "none" else parts.batch_size
@@ -138,7 +139,7 @@ def draw(
     )
 
 
-def shape(
+def with_shaped_reward(
     parts: UpdateParts,
     reward_state: RewardState | None,
     batch: Transition,
@@ -171,7 +172,7 @@ def shape(
 
 
 def added(parts: UpdateParts, batch: Transition, shaped: Transition) -> Added:
-    """What `shape` added to a batch; all of r* for a method that learns from r_D alone."""
+    """What shaping added to a batch; all of r* for a method that learns from r_D alone."""
     difference = shaped.reward
     if parts.algorithm.shaping != "alone":
         difference = shaped.reward - batch.reward
@@ -228,7 +229,9 @@ def update_agent(
     # The minibatch, with r* in place of r_e.
     batch, by_reward = parts.algorithm.replay.take(replay_state, draws.batch, parts.recent), None
     if reward_state is not None and not parts.stores_shaped:
-        shaped = shape(parts, reward_state, batch, hparams.discount, plan.reward_weight)
+        shaped = with_shaped_reward(
+            parts, reward_state, batch, hparams.discount, plan.reward_weight
+        )
         batch, by_reward = shaped, added(parts, batch, shaped)
     update_actor = plan.update_actor if parts.freezes_actor else True
     update_targets = True if parts.always_moves_targets else plan.update_targets

@@ -161,6 +161,9 @@ def test_traced_predicates_do_what_python_ones_do_and_stay_branches_under_vmap()
         known = [update(state, *data, **static)[0] for state, data in each]
         known = jax.tree.map(lambda *leaves: np.stack(leaves), *known)
         chex.assert_trees_all_close(result, known, rtol=1e-5, atol=1e-7)
+    state, data = each[0]
+    frozen = [update(state, *data, update_actor=False, clone=clone) for clone in (False, True)]
+    chex.assert_trees_all_equal(*frozen)
 
 
 def test_without_cloning_the_demonstrations_change_nothing():

@@ -38,6 +38,7 @@ from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.storage import checkpoints
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.training.methods import PAPER_METHODS
+from cmedirl_jax.training.settings import Settings
 from experiments import run_grid
 from tests.support import pools, trainers
 
@@ -488,7 +489,8 @@ def test_what_is_used_is_right_at_about_the_promised_rate(tmp_path, monkeypatch)
 
 def small_networks(training, monkeypatch):
     """Trainers of default settings are small ones."""
-    settings = trainers.with_(architecture={"hidden": (4,)})
+    starts = Settings().schedule.learning_starts
+    settings = trainers.with_(architecture={"hidden": (4,)}, schedule={"learning_starts": starts})
     make = functools.partial(training.make, settings=settings)
     monkeypatch.setattr(training, "make", make)
 
@@ -522,12 +524,22 @@ def test_the_phases_and_rates_of_a_task_on_the_host_are_measured(tmp_path, monke
     # Three more programs to compile; the command's own tests train in the same way.
     monkeypatch.setattr(host_tasks, "trainer", lambda *_, **__: lambda: None)
     small_networks(host_tasks.training, monkeypatch)
+    learned, run = [], host_tasks.host_loop.run
+
+    def noted(*arguments):
+        states, log = run(*arguments)
+        learned.append(log.learned.mean())
+        return states, log
+
+    monkeypatch.setattr(host_tasks.host_loop, "run", noted)
     out = tmp_path / "host.json"
     # As many steps as an episode has, so that one begins.
     few = ["--steps", "60", "--seeds", "2", "--rounds", "2", "--out", str(out)]
     assert host_tasks.main(["--tasks", "tests.support.host_tasks:Dock-v0", *few]) == 0
     (entry,) = json.loads(out.read_text())["tasks"]
-    assert set(entry["microseconds"]) == set(host_tasks.PHASES)
+    assert set(entry["microseconds"]) == {"simulator", "resets", "updates", "without updates"}
+    # The first episodes, the calls without updates, and those with them.
+    assert learned == [1.0, 0.0, 1.0]
     assert all(0.0 < spent < 1e6 for spent in entry["microseconds"].values())
     assert len(entry["rates"]) == 3
     assert all(len(rates) == 2 and min(rates) > 0.0 for rates in entry["rates"].values())

@@ -84,18 +84,34 @@ def test_another_agent_learns_from_the_irl_update():
 
 def test_a_population_breeds_its_hyperparameters():
     population = example("population")
-    population.AGENTS = 8
-    assert np.isfinite(population.main(generations=2, steps=250)).all()
     agent = ddpg.make(envs.make("Pendulum-v1").spec)
     agents = jax.jit(jax.vmap(agent.init))(jax.random.split(jax.random.key(0), 8))
+    rates = {name: np.linspace(1e-4, 8e-4, 8, dtype=np.float32) for name in population.RATES}
+    agents = agents.replace(hparams=agents.hparams.replace(**rates))
     bred = jax.jit(population.breed)(jax.random.key(1), agents, jnp.arange(8.0))
-    for before, after in zip(*map(jax.tree.leaves, (agents.actor, bred.actor)), strict=True):
+    for name, before in rates.items():
+        after = np.asarray(getattr(bred.hparams, name))
         np.testing.assert_array_equal(after[4:], before[4:])
-        np.testing.assert_array_equal(after[:4], before[4:])
-    for name in population.RATES:
-        before, after = (getattr(of.hparams, name) for of in (agents, bred))
-        np.testing.assert_array_equal(after[4:], before[4:])
-        assert (after[:4] != before[4:]).all()
+        # By factors of e^(half a standard normal number).
+        change = np.abs(np.log(after[:4] / before[4:]))
+        assert (change > 0.0).all()
+        assert (change < 2.5).all()
+    rest = (each.replace(hparams=None) for each in jax.device_get((agents, bred)))
+    for before, after in zip(*map(jax.tree.leaves, rest), strict=True):
+        np.testing.assert_array_equal(after, np.concatenate([before[4:], before[4:]]))
+
+
+def test_a_population_goes_on_with_what_was_bred(monkeypatch):
+    population = example("population")
+    population.AGENTS = 8
+
+    def spoil(key, agents, returns):
+        return agents.replace(actor=jax.tree.map(lambda leaf: jnp.nan * leaf, agents.actor))
+
+    monkeypatch.setattr(population, "breed", spoil)
+    first, last = population.main(generations=2, steps=250)
+    assert np.isfinite(first)
+    assert np.isnan(last)
 
 
 @pytest.mark.parametrize("name", PROGRAMS)

@@ -60,7 +60,7 @@ def drawn_actors(architecture):
 
 def drawn(method, settings, moved=0.1):
     """The actors and the reward states of seeds before their first step."""
-    # Not compiled, as what is loaded is not either: both run the same programs.
+    # Operation by operation, as the loaded reward is called: both run the same programs.
     init = trainers.compiled(method, settings)[0].algorithm.learner.init
     rewards = [init(jax.random.key(seed)) for seed in range(SEEDS)]
     # A table begins with zeros.

@@ -73,6 +73,22 @@ def test_another_c_library_is_left_alone(system, monkeypatch):
     start.share_heap(arenas=2)
 
 
+def test_a_core_is_for_as_many_seeds_as_are_asked(monkeypatch):
+    devices = []
+
+    def refuse(_):
+        raise UserError("enough")
+
+    monkeypatch.setattr(start, "cores", lambda: 64)
+    monkeypatch.setattr(start, "share_heap", lambda arenas: None)
+    monkeypatch.setattr(start.jax.config, "update", lambda _, count: devices.append(count))
+    monkeypatch.setattr(start.processes, "join", refuse)
+    for seeds, fewest in ((100, 4), (100, 32), (1_000, 4), (3, 4)):
+        with pytest.raises(UserError, match="enough"):
+            start.start(ClusterOptions(), None, seeds, {}, fewest)
+    assert devices == [25, 3, 64, 1]
+
+
 @pytest.mark.parametrize(
     ("error", "reason"),
     [

@@ -96,10 +96,12 @@ def test_a_seed_does_not_depend_on_its_neighbours_or_their_grouping():
     def numbers(state, log):
         return jax.tree.map(np.asarray, (state.agent, state.storage, log))
 
-    in_groups = jax.jit(seeds.map_groups(train, 5))
+    def in_groups(keys, group):
+        return numbers(*jax.jit(seeds.map_groups(train, group))(keys, data()))
+
     keys = seeds.keys(jax.random.key(3), 30)
-    ten = numbers(*in_groups(keys[:10], data()))
-    elsewhere = numbers(*in_groups(keys[np.r_[20:22, 7, 22:29]], data()))
+    ten = in_groups(keys[:10], 5)
+    elsewhere = in_groups(keys[np.r_[20:22, 7, 22:25]], 3)
     seventh, again = (
         jax.tree.map(lambda leaf, slot=slot: leaf[slot], result)
         for result, slot in ((ten, 7), (elsewhere, 2))
@@ -298,7 +300,7 @@ def test_update_period():
 
 
 def test_a_seed_learns_nothing_after_its_last_episode():
-    # Statistics are kept beside the parameters.
+    # The selection that keeps the parameters keeps the statistics beside them.
     architecture = {"actor_normalisation": "batch", "critic_normalisation": "batch"}
     _, state, advance = start("me-ddpg", with_(architecture=architecture))
     state, log = advance(state, 0, 2 * LIMIT, 2)

@@ -14,7 +14,7 @@ def test_a_terminated_transition_earns_what_the_absorbing_state_goes_on_to():
     parts = updates.make_parts(trainer.algorithm, METHODS["me-ddpg"], settings)
     reward = state.reward.replace(params=state.reward.params._replace(absorbing=jnp.asarray(0.3)))
     batch = replay.unpack(ENV.spec, jnp.ones((2, 7)))._replace(terminated=jnp.array([False, True]))
-    shaped = updates.shape(parts, reward, batch, 0.9, 0.5)
+    shaped = updates.with_shaped_reward(parts, reward, batch, 0.9, 0.5)
     r_d = trainer.algorithm.learner.reward(reward, batch.observation, batch.action)
     absorbing = 0.1 * np.tanh(0.3)
     expected = batch.reward + 0.5 * (r_d + np.array([0.0, 0.9 / (1 - 0.9) * absorbing]))

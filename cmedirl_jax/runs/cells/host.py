@@ -112,7 +112,8 @@ def _on(device: Any, tree: Any) -> Any:
         if isinstance(leaf, jax.Array):
             for shard in leaf.addressable_shards:
                 if shard.device == device:
-                    return shard.data
+                    # The only shard may be the array itself, whose mesh would compile once more.
+                    return jax.device_put(shard.data, device)
         return leaf
 
     return jax.tree.map(local, tree)

@@ -88,8 +88,8 @@ def _mean(rewards: Rewards, mdp: FiniteMDP) -> jax.Array:
     states = jnp.asarray(interpolation.points(mdp.states))
     actions = jnp.asarray(interpolation.points(mdp.actions))[jnp.array(SHOWN)]
     pairs = jnp.broadcast_to(states[:, None], (len(states), len(SHOWN), 2))
-    done = jnp.broadcast_to(actions[None], (len(states), len(SHOWN), 1))
-    every = jax.jit(lambda each: jax.lax.map(lambda one: rewards.reward(one, pairs, done), each))
+    tried = jnp.broadcast_to(actions[None], (len(states), len(SHOWN), 1))
+    every = jax.jit(lambda each: jax.lax.map(lambda one: rewards.reward(one, pairs, tried), each))
     return jnp.mean(every(rewards.params), axis=0)
 
 

@@ -43,7 +43,7 @@ class RewardReport(NamedTuple):
         summary: a row for each measure of each method.
         correlations: a row for each diagnostic of each method.
         retraining: a row for each measure of each method's agents; None without.
-        outdated: what the retraining lacks, or has and the run has not; None: nothing.
+        outdated: a line on the rewards that have no fresh agents yet; None: all have.
     """
 
     rows: pl.DataFrame
@@ -125,7 +125,7 @@ def write(
 
 
 def _outdated(rows: pl.DataFrame, evaluations: pl.DataFrame) -> str | None:
-    """How the rewards that were retrained differ from those of the run."""
+    """A line on the rewards that have no fresh agents yet; None: all have."""
     missing = rows.join(evaluations, on=LEARNER, how="anti")
     if missing.is_empty():
         return None

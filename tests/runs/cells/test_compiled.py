@@ -3,7 +3,7 @@ import jax
 import numpy as np
 import pytest
 
-from cmedirl_jax import training
+from cmedirl_jax import envs, training
 from cmedirl_jax.runs.cells import compiled as compiled_lib
 from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.training import seeds
@@ -54,6 +54,19 @@ def test_seeds_begin_as_the_trainer_lets_them(compiled, method):
     for seed, key in enumerate(seeds.keys(KEY, SEEDS + 1)[1:]):
         one = jax.tree.map(lambda leaf, seed=seed: leaf[seed], actor)
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-4), one, alone(key))
+
+
+def test_a_later_chunk_of_a_task_on_the_host_compiles_nothing():
+    task = envs.find("tests.support.host_tasks:Dock-v0")
+    compile_once = compiled_lib.compiler(task, jax.devices()[:1], capacity=50, subset_size=None)
+    programs = compile_once(METHODS["ddpg"], SMALL, SEEDS)
+    slots = Slots(programs.slots, SEEDS, programs.group, programs.devices)
+    state = compiled_lib.begin(programs, slots, KEY, None, 0)
+    for first in (0, 5, 10):
+        steps = np.arange(first, first + 5, dtype=np.int32)
+        state, _ = programs.run(state, 1, None, steps, None)
+    halves = programs.run.__self__._halves
+    assert halves.learn._cache_size() == halves.behave._cache_size() == 1
 
 
 @pytest.mark.parametrize("method", ["ddpg", "hs-me-ddpg"])
