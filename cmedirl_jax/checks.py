@@ -1,6 +1,6 @@
-"""Checks of arguments by name, and when numbers count as in bounds or equal.
+"""Checks of arguments by name.
 
-The checks run while tracing or on the host, and cost nothing in a compiled program. Shapes and
+They run while tracing or on the host, and cost nothing in a compiled program. Shapes and
 dtypes are always checked; values where they are known on the host, so those of traced arrays pass.
 """
 
@@ -17,10 +17,6 @@ from jax import export
 from cmedirl_jax import ranges
 from cmedirl_jax.ranges import Range
 from cmedirl_jax.types import Array, EnvSpec, Numeric, Transition
-
-ROUNDINGS = 100.0
-"""Roundings by which two numbers may differ and still count as equal. Steps of Gymnasium's own
-MountainCarContinuous-v0 differ from ours by less than 1."""
 
 LARGEST_ARRAY = 2**28
 """The most numbers of an array whose size is a power of the dimensions: 1 GiB in float32."""
@@ -112,28 +108,6 @@ def vectors(name: str, array: Any, size: int) -> None:
     kind(name, array, jnp.floating)
 
 
-def outside(vectors: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Which numbers of `[..., D]` leave their bounds by more than rounding, or are not finite.
-
-    Bounds may be infinite.
-    """
-    bounds = np.array([low, high], np.float64)
-    slack = 1e-6 * np.minimum(bounds[1] - bounds[0], np.maximum(1.0, np.abs(bounds)))
-    inside = (vectors >= bounds[0] - slack[0]) & (vectors <= bounds[1] + slack[1])
-    return ~(inside & np.isfinite(vectors))
-
-
-def tolerance(values: np.ndarray) -> np.ndarray:
-    """How far each number of `[N, D]` may differ: `ROUNDINGS` roundings of float32.
-
-    A rounding counts the number itself and the mean size of its column: what is left of a
-    difference has the rounding of what was subtracted. It counts a hundredth more, since a column
-    of zeros may be such a difference throughout, as is the sine of pi.
-    """
-    size = np.abs(values.astype(np.float64))
-    return ROUNDINGS * float(np.finfo(np.float32).eps) * (size + size.mean(axis=0) + 0.01)
-
-
 def sizes(**named: Numeric) -> None:
     """Check that static sizes are positive integers.
 
@@ -211,7 +185,7 @@ def within(interval: Range, **named: Numeric | Array) -> None:
         ValueError: naming the first that does not, what it must be, what it is and where.
     """
     for name, values in named.items():
-        if wrong := ranges.outside(interval, values):
+        if wrong := ranges.complaint(interval, values):
             raise ValueError(f"{name} {wrong}")
 
 

@@ -1,24 +1,19 @@
-"""Hyperparameters as leaves of a state, and an Adam whose learning rate is such a leaf."""
+"""An Adam whose learning rate is an argument of its update."""
 
 import functools
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import optax
 
 from cmedirl_jax.types import Numeric
 
-HParams = TypeVar("HParams")
-
-
-def traced(hparams: HParams) -> HParams:
-    """Convert the numbers to float32 arrays, so that every state has leaves of the same type."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hparams)
-
 
 def adam() -> optax.GradientTransformationExtraArgs:
-    """Adam whose `update` takes `learning_rate=`, so that the rate can be a traced leaf."""
+    """Adam whose `update` takes `learning_rate=`, so that the rate can be a traced leaf.
+
+    Without `learning_rate=` the updates are zero.
+    """
     moments = optax.scale_by_adam()
     return optax.GradientTransformationExtraArgs(
         moments.init, functools.partial(_update_adam, moments)

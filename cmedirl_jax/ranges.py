@@ -90,12 +90,12 @@ def out_of_range(settings: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
                 continue
             if interval is None:
                 raise TypeError(f"{name} has no range: annotate its field with one")
-            if wrong := outside(interval, number):
+            if wrong := complaint(interval, number):
                 yield name, wrong
 
 
-def outside(interval: Range, values: Any) -> str | None:
-    """What is wrong with the first number of `values` outside an interval; None if none is."""
+def complaint(interval: Range, values: Any) -> str | None:
+    """What is wrong with the first number outside an interval, "must be ..."; None if none is."""
     if not known(values):
         return None
     array = np.asarray(values)

@@ -10,9 +10,9 @@ from tests.support import ROOT
 
 LIBRARY = ROOT / "cmedirl_jax"
 TOP = (
-    *("types", "checks", "ranges", "registries"),
+    *("types", "checks", "ranges", "rounding", "registries"),
     *("networks", "normalisation", "observation_statistics"),
-    *("products", "optimizers", "grids", "modes"),
+    *("products", "hyperparameters", "optimizers", "grids", "modes"),
 )
 ROOMS = (
     *("io", "envs", "data", "agents", "irl", "tabular", "training", "assess"),

@@ -116,7 +116,7 @@ def assemble(
 
     Raises:
         ValueError: if the specification contradicts itself.
-        TypeError: if a bound is not an array of float32.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     checks.env_spec(spec)
     shapes = jax.tree.map(jnp.shape, jax.eval_shape(lambda: draw(jax.random.key(0))))

@@ -16,8 +16,8 @@ import optax
 
 from cmedirl_jax import checks, modes, observation_statistics, optimizers, ranges
 from cmedirl_jax import networks as networks_lib
+from cmedirl_jax.hyperparameters import traced
 from cmedirl_jax.networks import ActorCritic
-from cmedirl_jax.optimizers import traced
 from cmedirl_jax.ranges import NotNegative, Positive, PositiveShare, Share
 from cmedirl_jax.types import EnvSpec, Numeric, Params, Transition
 
@@ -122,8 +122,9 @@ class UpdateFn(Protocol):
             clone: whether the behaviour-cloning term is added, if there are demonstrations.
 
         Raises:
-            ValueError: if the batch's shapes are not `[B, O]`, `[B, A]` and `[B]`.
-            TypeError: if its leaves are not floats, and `terminated` bool.
+            ValueError: if the shapes of a batch are not `[B, O]`, `[B, A]` and `[B]`, or those of
+                demonstrations not `[D, O]`, `[D, A]` and `[D]`.
+            TypeError: if a leaf is not of floats, or `terminated` is not bool.
         """
         ...
 
@@ -169,6 +170,7 @@ def make(
 
     Raises:
         ValueError: if the specification contradicts itself, or a hyperparameter is out of range.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     checks.env_spec(spec)
     hparams = hparams or DDPGHParams()

@@ -30,7 +30,7 @@ import numpy as np
 from cmedirl_jax import checks, ranges
 from cmedirl_jax.agents import behaviour, densities
 from cmedirl_jax.agents.behaviour import Exploration, ExplorationKind
-from cmedirl_jax.optimizers import traced
+from cmedirl_jax.hyperparameters import traced
 from cmedirl_jax.ranges import AtLeastOne, NotNegative, Positive, Range, Share
 from cmedirl_jax.registries import Registry
 from cmedirl_jax.types import EnvSpec, Numeric
@@ -114,7 +114,9 @@ def make(
         hot_start: whether the actor is hot-started; its noise is multiplied by `hot_start_factor`.
 
     Raises:
-        ValueError: for an unknown kind, or a factor that takes epsilon above 1.
+        ValueError: for an unknown kind, a specification that contradicts itself, a hyperparameter
+            out of range, or a factor that takes one out of its range.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     settings = settings or ExplorationSettings()
     kind = EXPLORATIONS[settings.kind]
@@ -123,7 +125,11 @@ def make(
 
 
 def check_density(settings: ExplorationSettings, *, trajectories: bool, mixture: bool) -> None:
-    """Refuse weights for which the behaviour policy has no density; see `CheckDensityFn`."""
+    """Refuse weights for which the behaviour policy has no density; see `CheckDensityFn`.
+
+    Raises:
+        ValueError: naming the option that should be another; for an unknown kind.
+    """
     kind = EXPLORATIONS[settings.kind]
     kind.check_density(kind.hparams(settings), trajectories=trajectories, mixture=mixture)
 
@@ -132,7 +138,12 @@ def check_density(settings: ExplorationSettings, *, trajectories: bool, mixture:
 
 
 def gaussian(spec: EnvSpec, hparams: GaussianHParams | None = None) -> Exploration:
-    """clip(mu(s) + sigma eps) with eps ~ N(0, I). Its state is its hyperparameters."""
+    """clip(mu(s) + sigma eps) with eps ~ N(0, I). Its state is its hyperparameters.
+
+    Raises:
+        ValueError: if the specification contradicts itself, or a hyperparameter is out of range.
+        TypeError: if a size or a bound of the specification has a wrong type.
+    """
     initial = hparams or GaussianHParams()
     ranges.check(initial)
     return behaviour.assemble(
@@ -192,6 +203,10 @@ def ornstein_uhlenbeck(
     The recorded density is conditional on x_{t-1}. The one given mu(s) alone uses the stationary
     law of x, N(0, sigma^2 / (1 - (1 - theta)^2)), and needs 0 < theta < 2. It is an approximation:
     x is smaller at an episode's first steps, and later the state s depends on it.
+
+    Raises:
+        ValueError: if the specification contradicts itself, or a hyperparameter is out of range.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     initial = hparams or OrnsteinUhlenbeckHParams()
     ranges.check(initial)
@@ -291,6 +306,10 @@ def epsilon_greedy(spec: EnvSpec, hparams: EpsilonGreedyHParams | None = None) -
     The density given mu(s) alone puts the random actions' share of the steps in the place of
     epsilon. It is exact for `hold` 1. For more it uses the share in the long run, and neglects the
     same dependence.
+
+    Raises:
+        ValueError: if the specification contradicts itself, or a hyperparameter is out of range.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     initial = hparams or EpsilonGreedyHParams()
     ranges.check(initial)

@@ -97,9 +97,9 @@ def fit(
         The fitted `(actor, critic)`.
 
     Raises:
-        ValueError: if the pool does not fit the networks, a number of `hparams` is out of range, or
-            the subset is not of the pool.
-        TypeError: if a leaf of the pool has a wrong dtype.
+        ValueError: if the pool is not valid or does not fit the networks, a number of `hparams` is
+            out of range, or the subset is not of the pool.
+        TypeError: if a leaf of a prepared pool has a wrong dtype, or the subset is not of integers.
     """
     hparams = hparams or HotStartHParams()
     ranges.check(hparams)

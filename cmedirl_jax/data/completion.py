@@ -25,6 +25,9 @@ def complete(
 
     Returns:
         The pool, whose metadata name under "computed" what came from the task.
+
+    Raises:
+        ValueError: as `validation.absent`.
     """
     lacking = validation.absent(demonstrations)
     unseen = validation.unobserved(demonstrations)

@@ -111,8 +111,8 @@ def subset(
         size: length of the result; the entries after the first `n` are padding. Default `n`.
 
     Raises:
-        ValueError: if the pool holds fewer than `n` (or `size`) episodes, or `n` is not a scalar
-            or not positive.
+        ValueError: if the pool holds fewer than `n` (or `size`) episodes, `n` is not a scalar or,
+            where it is known, not between 1 and `size`, or `size` is not positive.
         TypeError: if `n` or `size` is not an integer.
     """
     checks.shape("n", n, ())

@@ -46,7 +46,8 @@ class Episodes(NamedTuple):
             drawn uniformly with replacement, as rows of the replay's storage, after `steps`
             transitions were added. `recent` restricts them to episodes that lie within so many
             latest transitions. If there is none, the mask is False throughout. Raises TypeError if
-            the bits are not unsigned integers, ValueError if `recent` is not positive.
+            the bits are not unsigned integers or `recent` is no integer, ValueError if `recent` is
+            not positive.
     """
 
     init: Callable[[], EpisodesState]

@@ -45,11 +45,14 @@ class Replay(NamedTuple):
         sample: `(key, state, batch_size, recent=None) -> Transition`, leaves `[batch_size, ...]`,
             drawn uniformly with replacement from all transitions or from the `recent` latest ones.
             An empty buffer gives zeros. Raises ValueError if `batch_size` is negative or `recent`
-            is not positive.
-        draw: `(key, batch_size) -> bits`, the randomness of `sample`, to draw ahead of time.
+            is not positive, TypeError if one of them is not an integer.
+        draw: `(key, batch_size) -> bits`, the randomness of `sample`, to draw ahead of time. Raises
+            as `sample`.
         take: `(state, bits, recent=None) -> Transition`; `sample` is `take` of `draw`. Raises
-            TypeError if the bits are not unsigned integers.
+            ValueError if `recent` is not positive, TypeError if it is not an integer or the bits
+            are not unsigned integers.
         rows: `(state, bits, recent=None) -> index`, the rows of the storage that `take` reads.
+            Raises as `take`.
         at: `(state, index [...]) -> Transition`, the transitions in these rows, leaves
             `[..., ...]`. Raises ValueError if a known index is not one of a row, TypeError if the
             indices are not integers.
@@ -68,8 +71,9 @@ def make(spec: EnvSpec, capacity: int) -> Replay:
     """Make a replay buffer of `capacity` transitions of `spec`'s sizes.
 
     Raises:
-        ValueError: if `capacity` is not positive.
-        TypeError: if it is not an integer.
+        ValueError: if `capacity` is not positive, or the specification contradicts itself.
+        TypeError: if `capacity` is not an integer, or a size or a bound of the specification has a
+            wrong type.
     """
     checks.env_spec(spec)
     checks.sizes(**{"replay capacity": capacity})

@@ -43,8 +43,10 @@ def from_trajectories(
         The pool, float32. It is not yet held to a task: see `validate`, `check` and `read`.
 
     Raises:
-        ValueError: if there is none, a field is missing or unknown, or the lengths of one
-            trajectory do not fit each other, naming it by its place.
+        ValueError: if there is none, sizes differ between trajectories, or there are no actions and
+            `env` is a name. Naming a trajectory by its place: if a field is missing, unknown or not
+            of numbers, its lengths do not fit each other, it does not end and is not the last one,
+            or it has actions or rewards and another has none.
     """
     if not trajectories:
         raise ValueError("there are no trajectories")

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks
+from cmedirl_jax import checks, rounding
 from cmedirl_jax.envs import Env, HostEnv, split_id
 from cmedirl_jax.envs.base import step_from
 from cmedirl_jax.types import Demonstrations, EnvSpec, Transition
@@ -28,10 +28,12 @@ def validate(demonstrations: Demonstrations, spec: EnvSpec | None = None) -> Non
     """Check a pool, against a task's specification if `spec` is given.
 
     Raises:
-        ValueError: naming the first mistake: wrong shapes or dtypes, no steps, values that are not
-            finite in fields that the metadata do not call absent, episodes out of order. With
-            `spec` also: another environment, observations or actions out of bounds, or a
-            `next_observation` that is not the following step's observation in the same episode.
+        ValueError: naming the first mistake: wrong shapes or dtypes, no steps, values in fields
+            that the metadata call absent, values that are not finite in others, episodes out of
+            order. With `spec` also: another environment, observations or actions out of bounds, a
+            `next_observation` that is not the following step's observation in the same episode, or
+            a specification that contradicts itself.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     transition, truncated, episode, metadata = demonstrations
     if spec is not None:
@@ -107,7 +109,7 @@ def _validate_bounds(arrays: dict[str, np.ndarray], spec: EnvSpec) -> None:
             continue
         of = name.removeprefix("next_")
         low, high = getattr(spec, f"{of}_low"), getattr(spec, f"{of}_high")
-        outside = checks.outside(arrays[name], low, high)
+        outside = rounding.outside(arrays[name], low, high)
         if outside.any():
             row, column = np.argwhere(outside)[0]
             raise ValueError(
@@ -119,7 +121,7 @@ def _validate_bounds(arrays: dict[str, np.ndarray], spec: EnvSpec) -> None:
 
 def _validate_continuity(arrays: dict[str, np.ndarray]) -> None:
     before = np.flatnonzero(np.diff(arrays["episode"]) == 0)
-    tolerance = checks.tolerance(arrays["next_observation"])[before]
+    tolerance = rounding.tolerance(arrays["next_observation"])[before]
     found = arrays["next_observation"][before].astype(np.float64)
     following = arrays["observation"][before + 1]
     wrong = np.argwhere(np.abs(found - following) > tolerance)
@@ -133,7 +135,11 @@ def _validate_continuity(arrays: dict[str, np.ndarray]) -> None:
 
 
 def can_be_repeated(demonstrations: Demonstrations, env: Env | HostEnv) -> bool:
-    """Whether `check` compares each step with the task's own, and not just bounds and order."""
+    """Whether `check` compares each step with the task's own, and not just bounds and order.
+
+    Raises:
+        ValueError: as `absent`.
+    """
     settable = isinstance(env, Env) and env.state_at is not None
     return settable and "action" not in absent(demonstrations)
 
@@ -155,6 +161,7 @@ def check(demonstrations: Demonstrations, env: Env | HostEnv, params: Any = None
     Raises:
         ValueError: as `validate`, or for the first step that is not the task's, naming the episode,
             the step, the field, its value, the task's value and the tolerance.
+        TypeError: as `validate`.
     """
     validate(demonstrations, env.spec)
     if isinstance(env, HostEnv) or not can_be_repeated(demonstrations, env):
@@ -162,7 +169,7 @@ def check(demonstrations: Demonstrations, env: Env | HostEnv, params: Any = None
     made = jax.tree.map(np.asarray, demonstrations.transition)
     found = np.column_stack([made.next_observation, made.reward, made.terminated])
     expected = steps(env, env.default_params if params is None else params, made)
-    tolerance = checks.tolerance(found)
+    tolerance = rounding.tolerance(found)
     # What was not observed is not compared.
     found = np.where(np.isnan(found), expected[0], found)
     unseen = unobserved(demonstrations)
@@ -188,7 +195,7 @@ def steps(env: Env, params: Any, made: Transition) -> np.ndarray:
     Next observation, reward and terminated side by side, `[3, N, O + 2]`.
     """
     observation, action = (x.astype(np.float32) for x in (made.observation, made.action))
-    nudge = (4.0 / checks.ROUNDINGS * checks.tolerance(observation)).astype(np.float32)
+    nudge = (4.0 / rounding.ROUNDINGS * rounding.tolerance(observation)).astype(np.float32)
 
     def step(observation: jax.Array, action: jax.Array) -> jax.Array:
         answer = step_from(env, params, observation, action)

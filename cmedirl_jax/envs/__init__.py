@@ -1,4 +1,9 @@
-"""Tasks: environments as pure functions, and Gymnasium's, both ways."""
+"""Tasks: environments as pure functions, and Gymnasium's, both ways.
+
+A task is an environment with its specification (name, bounds, time limit) and, in JAX, its default
+parameters: an `Env`, or a `HostEnv` that is stepped on the host. Arguments call a task `env`.
+"Environment" alone is what an agent acts in: environment steps, the environment's reward r_e.
+"""
 
 from cmedirl_jax.envs import wrappers
 from cmedirl_jax.envs.base import Env, Step

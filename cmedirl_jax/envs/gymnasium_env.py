@@ -131,7 +131,11 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return np.array(observation), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Step the episode; the time limit of the specification truncates it."""
+        """Step the episode; the time limit of the specification truncates it.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
         if self._episode is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         action = np.asarray(action, np.float32)
@@ -142,7 +146,11 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return np.array(observation), float(reward), bool(terminated), bool(truncated), {}
 
     def render(self) -> Any:
-        """A frame `[height, width, 3]` uint8; None in the mode "human"."""
+        """A frame `[height, width, 3]` uint8; None in the mode "human".
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
         if self._episode is None:
             raise gymnasium.error.ResetNeeded("call reset before render")
         return self._drawing.draw(self._episode.state, self._action)

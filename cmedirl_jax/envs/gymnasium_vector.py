@@ -65,7 +65,12 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin episodes: in all sub-environments, or in those of `options["reset_mask"]`."""
+        """Begin episodes: in all sub-environments, or in those of `options["reset_mask"]`.
+
+        Raises:
+            ValueError: for a mask that is no numpy array of `num_envs` bools or names none, or
+                another number of seeds.
+        """
         super().reset(seed=seed if isinstance(seed, int) else None)
         mask = (options or {}).get("reset_mask", np.ones(self.num_envs, bool))
         _check_mask(mask, self.num_envs)
@@ -101,7 +106,12 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step every sub-environment, and reset those that ended as the autoreset mode says."""
+        """Step every sub-environment, and reset those that ended as the autoreset mode says.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset; without autoreset also where an
+                episode has ended.
+        """
         if self._episodes is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         if self.mode is AutoresetMode.DISABLED and self._over.any():
@@ -128,7 +138,11 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return np.array(self._observations), rewards, terminated, truncated, infos
 
     def render(self) -> tuple[Any, ...] | None:
-        """A frame of each sub-environment."""
+        """A frame of each sub-environment.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
         if self._episodes is None:
             raise gymnasium.error.ResetNeeded("call reset before render")
         assert self._drawing is not None
@@ -225,6 +239,8 @@ def to_gymnasium_vector(
         render_mode: "rgb_array", where Gymnasium has a picture of the task.
 
     Raises:
-        ValueError: for an unknown mode, or if Gymnasium cannot draw the task.
+        ValueError: if `num_envs` is not positive, for an unknown mode, or if Gymnasium cannot draw
+            the task.
+        TypeError: if `num_envs` is not an integer.
     """
     return GymnasiumVectorEnv(env, num_envs, params, autoreset_mode, render_mode)

@@ -27,6 +27,8 @@ class HostEnv(NamedTuple):
         spec: the sizes and bounds.
         vector: `(count) -> gymnasium.vector.VectorEnv` of so many sub-environments, in any
             autoreset mode. Its `reset` knows the option `reset_mask`, as those of Gymnasium do.
+            The `vector` of `from_gymnasium` raises ValueError if the count is not positive,
+            TypeError if it is not an integer.
     """
 
     spec: EnvSpec
@@ -55,8 +57,9 @@ def from_gymnasium(
 
     Raises:
         ValueError: if Gymnasium does not know the name, or the task cannot be made; for a space
-            that is no box of one axis, actions that are no floats or have no bounds, a task without
-            a time limit, or one whose observations or rewards are not what its spaces say.
+            that is no box of one axis or whose low is not below its high, actions that are no
+            floats or have no bounds, a task without a time limit, or one whose observations or
+            rewards are not what its spaces say.
     """
     name = id if isinstance(id, str) else getattr(id, "__name__", type(id).__name__)
     make_one = functools.partial(_make, id, tuple(wrappers), max_episode_steps, kwargs)

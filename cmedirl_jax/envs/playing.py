@@ -43,6 +43,9 @@ def play(
         act: observations `[n, O]` -> actions `[n, A]`.
         seeds: `[n, E]`, of the starts of each one's episodes.
         max_episode_steps: steps after which an episode is cut.
+
+    Raises:
+        ValueError: as `stepping.restart`.
     """
     count, episodes = seeds.shape
     every, episode, length = np.arange(count), np.zeros(count, int), np.zeros(count, int)

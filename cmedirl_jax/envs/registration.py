@@ -23,7 +23,11 @@ _NO_LIMIT = 2**31 - 1
 
 
 def make_one(*, task: str, render_mode: str | None = None) -> gymnasium.Env:
-    """Make a registered task; `gymnasium.make` adds the time limit."""
+    """Make a registered task; `gymnasium.make` adds the time limit.
+
+    Raises:
+        ValueError: if there is no such task, or Gymnasium cannot draw it.
+    """
     env = make(task)
     params = env.default_params.replace(max_episode_steps=_NO_LIMIT)
     return to_gymnasium(env, params, render_mode=render_mode)
@@ -39,6 +43,10 @@ def make_vector(
     """Make a registered task many times over, for None or -1 without a limit.
 
     See `to_gymnasium_vector`.
+
+    Raises:
+        ValueError: if there is no such task, and as `to_gymnasium_vector`.
+        TypeError: as `to_gymnasium_vector`.
     """
     env = make(task)
     limit = _NO_LIMIT if max_episode_steps in (None, -1) else max_episode_steps

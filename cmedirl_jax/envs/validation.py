@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks, modes
+from cmedirl_jax import checks, modes, rounding
 from cmedirl_jax.envs.base import Env, Step
 from cmedirl_jax.types import EnvSpec
 
@@ -26,11 +26,12 @@ def check(env: Env, params: Any = None, *, steps: int | None = None) -> None:
             are only traced, and `params` may be traced too.
 
     Raises:
-        ValueError: naming what has a wrong shape or structure. In play, saying what the task did
-            and what its specification says: observations out of bounds, values that are not finite,
-            an episode that goes on after `max_episode_steps`, or another step from
-            `state_at(observation)` than from the state that was observed.
-        TypeError: naming what has a wrong dtype; for a task on the host.
+        ValueError: if the specification contradicts itself or `steps` is negative; naming what has
+            a wrong shape or structure. In play, saying what the task did and what its specification
+            says: observations out of bounds, values that are not finite, an episode that goes on
+            after `max_episode_steps`, or another step from `state_at(observation)` than from the
+            state that was observed.
+        TypeError: naming what has a wrong type; for a task on the host.
     """
     if not isinstance(env, Env):
         raise TypeError(
@@ -162,7 +163,7 @@ def _check_played(env: Env, params: Any, steps: int) -> None:
 def _check_bounds(spec: EnvSpec, name: str, observations: np.ndarray) -> None:
     """Check observations `[T, E, O]`."""
     low, high = spec.observation_low, spec.observation_high
-    outside = checks.outside(observations, low, high)
+    outside = rounding.outside(observations, low, high)
     if outside.any():
         time, episode, index = np.argwhere(outside)[0]
         found = observations[time, episode, index]
@@ -179,7 +180,7 @@ def _check_state_at(spec: EnvSpec, running: np.ndarray, step: Step, again: Step)
             getattr(made, name)[running].astype(np.float64).reshape(running.sum(), -1)
             for made in (step, again)
         )
-        wrong = ~(np.abs(found - expected) <= checks.tolerance(expected))
+        wrong = ~(np.abs(found - expected) <= rounding.tolerance(expected))
         if wrong.any():
             place = tuple(np.argwhere(wrong)[0])
             raise ValueError(

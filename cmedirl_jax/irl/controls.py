@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from cmedirl_jax import checks, normalisation, ranges
+from cmedirl_jax.hyperparameters import traced
 from cmedirl_jax.irl import base, regularisers, rewards
 from cmedirl_jax.irl.base import RewardLearner, RewardState
 from cmedirl_jax.irl.learner import IRLHParams
-from cmedirl_jax.optimizers import traced
 from cmedirl_jax.ranges import Positive
 from cmedirl_jax.types import EnvSpec, Network, Params
 
@@ -85,6 +85,7 @@ def random(
     Raises:
         ValueError: if the specification contradicts itself, or the bound of the reward or `share`
             is out of range.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     checks.env_spec(spec)
     hparams = hparams or IRLHParams()

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import optax
 
 from cmedirl_jax import checks, observation_statistics, optimizers, ranges
+from cmedirl_jax.hyperparameters import traced
 from cmedirl_jax.irl import base, regularisers, rewards
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
-from cmedirl_jax.optimizers import traced
 from cmedirl_jax.ranges import NotNegative, Positive
 from cmedirl_jax.types import EnvSpec, Network, Params, RewardBatch, Transition
 
@@ -57,6 +57,7 @@ def make(
 
     Raises:
         ValueError: if the specification contradicts itself, or a hyperparameter is out of range.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     checks.env_spec(spec)
     hparams = hparams or GAILHParams()

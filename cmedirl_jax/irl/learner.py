@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import optax
 
 from cmedirl_jax import checks, modes, normalisation, observation_statistics, optimizers, ranges
+from cmedirl_jax.hyperparameters import traced
 from cmedirl_jax.irl import base, objectives, regularisers, rewards
 from cmedirl_jax.irl.base import RewardInfo, RewardLearner, RewardState
 from cmedirl_jax.irl.objectives import OBJECTIVES, Likelihood, ObjectiveName
 from cmedirl_jax.irl.regularisers import BoundKind, Gauge
-from cmedirl_jax.optimizers import traced
 from cmedirl_jax.ranges import POSITIVE, NotNegative, Share
 from cmedirl_jax.types import EnvSpec, Network, Params, RewardBatch, Transition
 
@@ -112,6 +112,7 @@ def make(
     Raises:
         ValueError: if the specification contradicts itself, a hyperparameter is out of range, or
             there is no such objective.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     checks.env_spec(spec)
     hparams = hparams or IRLHParams()
@@ -286,6 +287,9 @@ def log_likelihood(
         batches: demonstrations and background.
         r_d: r_D of each batch's steps, `[B]`, or `[M * T]` for trajectories.
         absorbed: `[]`, r_D of the absorbing state; None without one.
+
+    Raises:
+        ValueError: if there is no such objective.
     """
     objective, append = OBJECTIVES[hparams.objective], hparams.append_demonstrations
     demonstrations, background = objectives.weighed(

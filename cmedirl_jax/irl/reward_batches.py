@@ -129,7 +129,9 @@ def make(
         append: whether the demonstrations join the samples, and so the mixture they are drawn from.
 
     Raises:
-        ValueError: if a number of the settings is out of range.
+        ValueError: if a number of the settings is out of range, there is no such objective, or
+            trajectories are asked of a `capacity` that is not positive.
+        TypeError: if trajectories are asked of a `capacity` that is not an integer.
     """
     ranges.check(settings)
     source = _source(spec, replay, capacity, settings, objective)

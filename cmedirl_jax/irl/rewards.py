@@ -88,7 +88,9 @@ def make(
         normalise: how a deep reward normalises observations; the others need bounds.
 
     Raises:
-        ValueError: for an unknown kind, or one that needs finite bounds that `spec` lacks.
+        ValueError: for an unknown kind, and as the kind's own function: `mlp`, `radial_basis` or
+            `fourier`.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     settings = settings or RewardNetworkSettings()
     inputs = "state" if state_only else settings.inputs
@@ -106,6 +108,10 @@ def mlp(
     It is the critic's network without normalisation of its layers: the observation is normalised as
     `normalise` says, and the action joins at the input. With inputs "state" it is the actor's
     network with one output.
+
+    Raises:
+        ValueError: if the specification contradicts itself, or for an unknown `normalise`.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     checks.env_spec(spec)
     architecture = networks.Architecture(
@@ -141,6 +147,10 @@ def linear(spec: EnvSpec, features: Features) -> Network:
 
     It starts from theta = 0 and ignores the key: there is no symmetry to break, and a reward of
     zero has no preference. Without a bound the likelihood is concave in theta.
+
+    Raises:
+        ValueError: if the specification contradicts itself.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     checks.env_spec(spec)
     size = jax.eval_shape(features, spec.observation_low, spec.action_low).shape[-1]
@@ -159,8 +169,10 @@ def radial_basis(spec: EnvSpec, centres: int, inputs: Inputs = "state-action") -
     of the action whose coefficients vary over the states.
 
     Raises:
-        ValueError: if there are fewer than two centres, the observation has a bound beyond 1e6, or
-            the grid, or later the features of a batch, are above `checks.LARGEST_ARRAY`.
+        ValueError: if the specification contradicts itself, there are fewer than two centres, the
+            observation has a bound beyond 1e6, or the grid, or later the features of a batch, are
+            above `checks.LARGEST_ARRAY`.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     checks.env_spec(spec)
     if centres < 2:
@@ -204,8 +216,10 @@ def fourier(spec: EnvSpec, order: int, inputs: Inputs = "state-action") -> Featu
     the `d` inputs scaled to [0, 1]: the observation, and then the action.
 
     Raises:
-        ValueError: if the order is less than one, an input has a bound beyond 1e6, or the
-            frequencies, or later the features of a batch, are above `checks.LARGEST_ARRAY`.
+        ValueError: if the specification contradicts itself, the order is less than one, the
+            observation has a bound beyond 1e6, or the frequencies, or later the features of a
+            batch, are above `checks.LARGEST_ARRAY`.
+        TypeError: if a size or a bound of the specification has a wrong type.
     """
     checks.env_spec(spec)
     if order < 1:

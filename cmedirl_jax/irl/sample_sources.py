@@ -128,6 +128,10 @@ def trajectories(
             all that the replay still holds from end to end.
         episodes: the background's latest episodes that are drawn from.
         max_length: `T`, steps of the longest trajectory. Longer demonstrations are cut.
+
+    Raises:
+        ValueError: if `episodes`, `replay_capacity` or `max_length` is not positive.
+        TypeError: if one of them is not an integer.
     """
     ring = episodes_lib.make(episodes, replay_capacity, max_length)
     return SampleSource(

@@ -169,6 +169,7 @@ def mixture(
 
     Raises:
         ValueError: if `snapshots` or `period` is not positive.
+        TypeError: if one of them is not an integer.
     """
     checks.sizes(snapshots=snapshots, snapshot_period=period)
     # As many demonstrations as samples of the background.

@@ -45,8 +45,8 @@ def check(folder: Path, learned: LearnedCell) -> None:
     """Refuse an export before the work that comes before it.
 
     Raises:
-        UserError: without the extra, if something lies in the folder's place, or for a method that
-            learns no reward.
+        UserError: without the extra, if something lies in the folder's place, if the folder cannot
+            be written, or for a method that learns no reward.
     """
     missing = [
         name for name in ("safetensors", "flatbuffers") if not importlib.util.find_spec(name)
@@ -88,7 +88,12 @@ def save(
         summary: a row for each measure of each cell.
 
     Raises:
-        UserError: if a function cannot be written in numpy.
+        UserError: if the learner diverged, the run's configuration cannot be read, or a function
+            cannot be written in numpy.
+        ValueError: if the method learns no reward, or a file of its cell is damaged.
+        FileExistsError: if something lies at `folder`.
+        OSError: if the folder cannot be written.
+        ModuleNotFoundError: without the extra `export`.
     """
     from cmedirl_jax.runs.report.reward_cards import MEASURES
 

@@ -25,7 +25,7 @@ from cmedirl_jax.runs.console import screen
 from cmedirl_jax.runs.console.phases import phase
 from cmedirl_jax.runs.console.progress import Reporter, reporter, stepwise
 from cmedirl_jax.runs.console.signals import Interruption
-from cmedirl_jax.runs.loggers.background import Log
+from cmedirl_jax.runs.loggers.background import CellLog
 from cmedirl_jax.runs.storage import cells, checkpoints, plain, tables
 from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.runs.storage import folder as run_folder
@@ -94,9 +94,9 @@ class Session(NamedTuple):
             cluster=self.cluster,
         )
 
-    def log(self, cell: Cell, pool: LearnersPool | None) -> Log:
+    def log(self, cell: Cell, pool: LearnersPool | None) -> CellLog:
         """Logs a cell, on process 0."""
-        return Log(
+        return CellLog(
             self.plan.folder / run_folder.LOG / cell.name,
             self.plan.log if self.cluster.writer else (),
             cell.block,
@@ -300,7 +300,7 @@ def _train(
     pool: LearnersPool | None,
     solved: float,
     report: Reporter,
-    log: Log,
+    log: CellLog,
 ) -> tuple[CellResult, Evaluator]:
     """Train a cell; gives its evaluator too."""
     plan, key, budget = session.plan, session.keys.learners, session.plan.budget

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from cmedirl_jax import checks, ranges
+from cmedirl_jax.hyperparameters import traced
 from cmedirl_jax.irl import IRLHParams, RewardLearner, RewardState, base
-from cmedirl_jax.optimizers import traced
 from cmedirl_jax.tabular import interpolation
 from cmedirl_jax.tabular.interpolation import Grid
 from cmedirl_jax.types import Numeric

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cmedirl_jax import checks
+from cmedirl_jax import rounding
 from cmedirl_jax.data import demonstrations
 from cmedirl_jax.types import Demonstrations, Transition
 from tests.support import pools
@@ -47,7 +47,7 @@ def test_episodes_of_gymnasium_are_of_the_task_to_less_than_a_rounding(monkeypat
     assert pool.transition.reward.dtype == np.float64
     assert pool.transition.terminated.sum() == pool.truncated.sum() == 1
     demonstrations.check(pool, ENV)
-    monkeypatch.setattr(checks, "ROUNDINGS", 1.0)
+    monkeypatch.setattr(rounding, "ROUNDINGS", 1.0)
     demonstrations.check(pool, ENV)
 
 

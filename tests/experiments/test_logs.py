@@ -12,7 +12,7 @@ from cmedirl_jax.data import demonstrations
 from cmedirl_jax.runs import start
 from cmedirl_jax.runs.cells import cell, compiled, tabular_cell
 from cmedirl_jax.runs.cluster.base import ALONE
-from cmedirl_jax.runs.loggers.background import Log
+from cmedirl_jax.runs.loggers.background import CellLog
 from cmedirl_jax.runs.storage import tables
 from experiments import report, run_grid
 from tests.support import logs, pools
@@ -71,9 +71,9 @@ def test_a_run_that_was_stopped_and_goes_on_has_the_log_of_one_that_was_not(
         if len(evaluations) == 3:
             signal.raise_signal(signal.SIGTERM)
 
-    follow = Log.follow
+    follow = CellLog.follow
     with monkeypatch.context() as patch:
-        patch.setattr(Log, "follow", stopping)
+        patch.setattr(CellLog, "follow", stopping)
         assert main("--out", "stopped", *both) == 143
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     (cut,) = stopped.glob("log/ddpg-seeds-0-1/csv/mean.csv")

@@ -65,12 +65,12 @@ def cut(length: int, ends: np.ndarray) -> list[slice]:
 
 
 def of_trajectories(source: Any, env: str | EnvSpec | None) -> Demonstrations:
-    """A list of dictionaries, see `demonstrations.from_trajectories`."""
+    """A list of dictionaries, see `from_trajectories`; raises as `base.Read`."""
     return from_trajectories(source, named(env))
 
 
 def of_imitation(source: Any, env: str | EnvSpec | None) -> Demonstrations:
-    """imitation's npz."""
+    """imitation's npz; raises as `base.Read`."""
     found = read_npz(source, ("obs", "acts", "terminal", "indices"), ("rews",))
     steps = cut(len(found["acts"]), found["indices"])
     if found["terminal"].shape != (len(steps),):
@@ -93,7 +93,10 @@ def of_imitation(source: Any, env: str | EnvSpec | None) -> Demonstrations:
 
 
 def of_stable_baselines(source: Any, env: str | EnvSpec | None) -> Demonstrations:
-    """stable-baselines' npz, which says neither how an episode ended nor what was observed last."""
+    """stable-baselines' npz, which says neither how an episode ended nor what was observed last.
+
+    Raises as `base.Read`.
+    """
     found = read_npz(source, ("obs", "actions", "episode_starts"), ("rewards",))
     starts = np.flatnonzero(np.asarray(found["episode_starts"], bool))
     rows = cut(len(found["obs"]), np.r_[starts[1:], len(found["obs"])])
@@ -119,7 +122,10 @@ _D4RL_OPTIONAL = ("rewards", "timeouts", "next_observations")
 
 
 def of_d4rl(source: Any, env: str | EnvSpec | None) -> Demonstrations:
-    """A dictionary of d4rl's arrays; where there are no timeouts, only terminals end an episode."""
+    """A dictionary of d4rl's arrays; where there are no timeouts, only terminals end an episode.
+
+    Raises as `base.Read`.
+    """
     missing = [name for name in _D4RL if name not in source]
     if missing:
         raise ValueError(f"it has no array {missing[0]!r}")
@@ -150,7 +156,7 @@ def of_d4rl(source: Any, env: str | EnvSpec | None) -> Demonstrations:
 
 
 def of_d4rl_file(source: Any, env: str | EnvSpec | None) -> Demonstrations:
-    """The same of an npz file, or an HDF5 file."""
+    """The same of an npz file, or an HDF5 file; raises as `base.Read`."""
     if is_file(source, ".npz"):
         return of_d4rl(read_npz(source, _D4RL, _D4RL_OPTIONAL), env)
     import h5py  # type: ignore[import-not-found]

@@ -11,7 +11,18 @@ class Read(Protocol):
     """Read demonstrations."""
 
     def __call__(self, source: Any, env: str | EnvSpec | None) -> Demonstrations:
-        """Read them; `env` names their task where the source does not."""
+        """Read them.
+
+        Args:
+            source: a path, an id or an object in memory.
+            env: names their task where the source does not.
+
+        Raises:
+            ValueError: for a source that is damaged or another format's, or that names no task
+                where `env` is None.
+            OSError: for a source that cannot be read.
+            ModuleNotFoundError: where a package is missing.
+        """
         ...
 
 
@@ -22,11 +33,12 @@ class Format(NamedTuple):
         description: what it is, in a line.
         recognises: `(source) -> bool`, by a look at a path's name or first bytes, an id or an
             object in memory; raises nothing.
-        read: see `Read`. Raises ValueError for a source that is damaged or another format's,
-            OSError for one that cannot be read, ModuleNotFoundError where a package is missing.
+        read: see `Read`.
         writes: `(target) -> bool`: whether a target's name, a path or an id, is that of this
             format; None for a format that is only read.
-        write: `(target, demonstrations, spec)`. Raises as `read`.
+        write: `(target, demonstrations, spec)`. Raises ValueError for a pool or a target that the
+            format does not take, OSError where it cannot be written, ModuleNotFoundError where a
+            package is missing.
         package: the extra that it needs; None for none.
     """
 

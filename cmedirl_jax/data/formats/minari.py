@@ -42,8 +42,10 @@ def from_minari(source: str | Path, env: str | EnvSpec | None = None) -> Demonst
         env: the task, its name or specification; default the name that the dataset gives it.
 
     Raises:
-        ValueError: for spaces that are no boxes of one axis, or if nothing names the environment.
+        ValueError: if it is damaged, for spaces that are no boxes of one axis, an episode that goes
+            on after its end, or if nothing names the environment.
         FileNotFoundError: if there is no such dataset here.
+        ModuleNotFoundError: without the extra `minari`.
     """
     import minari  # type: ignore[import-not-found]
 
@@ -114,6 +116,8 @@ def to_minari(
 
     Raises:
         ValueError: for another form of id, one that is taken, or a pool without actions or rewards.
+        TypeError: for a fact that Minari does not know.
+        ModuleNotFoundError: without the extra `minari`.
     """
     import minari  # type: ignore[import-not-found]
     from minari.data_collector.episode_buffer import EpisodeBuffer  # type: ignore[import-not-found]

@@ -24,6 +24,7 @@ def save(path: str | Path, demonstrations: Demonstrations) -> None:
     Raises:
         ValueError: if the pool is not valid, or its metadata do not name the environment: `load`
             compares that with its `spec`.
+        TypeError: if the metadata are not JSON values.
         OSError: if the file cannot be written.
     """
     validate(demonstrations)
@@ -51,6 +52,7 @@ def load(path: str | Path, spec: EnvSpec | None = None) -> Demonstrations:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not a regular file, or is damaged, of another kind or version, or not
             valid for `spec`.
+        TypeError: as `validate`.
     """
     path = Path(path)
     # Reading a pipe could block for ever.

@@ -56,6 +56,7 @@ def read(
         ValueError: as `parse`, and for pools that do not fit the task.
         OSError: as `parse`.
         ModuleNotFoundError: as `parse`.
+        TypeError: as `validation.validate`.
     """
     task = env.spec if isinstance(env, Env | HostEnv) else env
     pool = parse(source, format, task)
@@ -81,8 +82,8 @@ def parse(
         env: the task's name, or its specification, which state-only demonstrations need.
 
     Raises:
-        ValueError: naming the source and the format it was read as: for a source that no format
-            recognises, and for damaged or inconsistent ones.
+        ValueError: for an unknown format or a source that no format recognises. For a damaged or
+            inconsistent one, naming the source and the format it was read as.
         OSError: if a file cannot be read, or is not there.
         ModuleNotFoundError: naming the extra that the format needs.
     """

@@ -31,7 +31,7 @@ ENDINGS = (".csv", ".parquet")
 
 
 def of_table(source: Any, env: str | EnvSpec | None) -> Demonstrations:
-    """A CSV or Parquet file."""
+    """A CSV or Parquet file; raises as `base.Read`."""
     import polars as pl
 
     read = pl.read_csv if str(source).lower().endswith(".csv") else pl.read_parquet
@@ -107,8 +107,9 @@ def write_table(path: str | Path, demonstrations: Demonstrations) -> None:
     """Write a pool as a CSV or Parquet file, by the name's ending; what is absent has no column.
 
     Raises:
-        ValueError: for another ending.
+        ValueError: for another ending, or as `validation.absent`.
         OSError: if it cannot be written.
+        ModuleNotFoundError: without polars, of the extra `cli`.
     """
     made, columns = demonstrations.transition, {"episode": np.asarray(demonstrations.episode)}
     lacking = absent(demonstrations)
@@ -129,6 +130,7 @@ def write_template(path: str | Path, spec: EnvSpec) -> None:
     Raises:
         ValueError: for an ending that is neither .csv nor .parquet.
         OSError: if it cannot be written.
+        ModuleNotFoundError: without polars, of the extra `cli`.
     """
 
     def numbered(name: str, count: int) -> dict[str, list[float]]:
@@ -160,7 +162,10 @@ def _write(path: Path, columns: dict[str, Any]) -> None:
 
 
 def of_imitation_folder(source: Any, env: str | EnvSpec | None) -> Demonstrations:
-    """A folder that imitation saved: Arrow streams with a row for each trajectory."""
+    """A folder that imitation saved: Arrow streams with a row for each trajectory.
+
+    Raises as `base.Read`.
+    """
     import polars as pl
 
     files = sorted(Path(source).glob("*.arrow"))

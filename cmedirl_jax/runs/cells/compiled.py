@@ -17,7 +17,7 @@ from cmedirl_jax.runs.cells import host, pools
 from cmedirl_jax.runs.cells.evaluator import Evaluator
 from cmedirl_jax.runs.cells.slots import Slots
 from cmedirl_jax.runs.cluster.base import ALONE
-from cmedirl_jax.training import Log, TrainingState, seeds
+from cmedirl_jax.training import Log, Trainer, TrainingState, seeds
 from cmedirl_jax.training.methods import METHODS, Method
 from cmedirl_jax.training.settings import Settings
 from cmedirl_jax.types import DemonstrationSubset
@@ -62,7 +62,7 @@ class CompiledMethod(NamedTuple):
 
 
 def compile_networks(
-    env: Env | HostEnv, architecture: Architecture, group: int, devices: Sequence[Any]
+    env: Env | HostEnv, devices: Sequence[Any], architecture: Architecture, group: int
 ) -> Callable[[jax.Array, int], Any]:
     """Jit the drawing of the networks that every method starts from: `(keys, groups) -> networks`.
 
@@ -79,10 +79,10 @@ def compile_networks(
 
 def compile_hot_start(
     env: Env | HostEnv,
-    settings: Settings,
-    subset_size: int | None,
-    group: int,
     devices: Sequence[Any],
+    subset_size: int | None,
+    settings: Settings,
+    group: int,
 ) -> Callable[..., Any]:
     """Jit the hot start, which all methods that have one share; see `CompiledMethod.hot_start`."""
     trainer = training.make(env, METHODS["bc"], settings, capacity=1, subset_size=subset_size)
@@ -155,48 +155,60 @@ def compile_method(
     def spread(function: Callable) -> Callable:
         return seeds.map_devices(seeds.step_groups(function, group), devices)
 
-    def start(
-        keys: jax.Array,
-        networks: Any,
-        episodes: DemonstrationSubset | None,
-        first: Any,
-        groups: int,
-        data: HotStartData | None,
-        n_demos: int,
-    ) -> TrainingState:
-        def of_seed(seed: tuple[jax.Array, Any, Any, Any], data: HotStartData | None, n_demos: int):
-            key, networks, episodes, first = seed
-            data = None if data is None else data._replace(episodes=episodes)
-            return seed, trainer.init(key, data, n_demos, networks, first)
-
-        return spread(of_seed)((keys, networks, episodes, first), groups, data, n_demos)[1]
-
-    def permute(state: TrainingState, move: np.ndarray) -> TrainingState:
-        return jax.tree.map(lambda leaf: leaf[move], state)
-
     # The same sharding everywhere: JAX compiles again for another one, even if it is equivalent.
     split = seeds.sharding(devices)
     slots = seeds.padded(seeds_count, group, len(devices))
-    steps = None
     if vectors is not None:
         of_device = [functools.partial(vector, slots // len(devices)) for vector in vectors]
         steps = host.Steps(trainer, env.spec, of_device, devices)
+        first, run, resume = steps.first, steps.run, steps.resume
+    else:
+        first, resume = lambda keys: None, lambda state, step: state
+        run = jax.jit(spread(trainer.run), donate_argnums=0, out_shardings=split)
+    init = functools.partial(_init, spread(functools.partial(_init_seed, trainer)))
     return CompiledMethod(
         draw_networks=draw_networks,
         hot_start=hot_start,
-        init=jax.jit(start, out_shardings=split),
-        first=steps.first if steps else lambda keys: None,
-        run=steps.run
-        if steps
-        else jax.jit(spread(trainer.run), donate_argnums=0, out_shardings=split),
-        resume=steps.resume if steps else lambda state, step: state,
-        permute=jax.jit(permute, donate_argnums=0, out_shardings=split),
+        init=jax.jit(init, out_shardings=split),
+        first=first,
+        run=run,
+        resume=resume,
+        permute=jax.jit(_permute, donate_argnums=0, out_shardings=split),
         evaluator=evaluator,
         slots=slots,
         group=group,
         devices=len(devices),
         sharding=split,
     )
+
+
+def _init(
+    init_seeds: Callable[..., tuple[Any, TrainingState]],
+    keys: jax.Array,
+    networks: Any,
+    episodes: DemonstrationSubset | None,
+    first: Any,
+    groups: int,
+    data: HotStartData | None,
+    n_demos: int,
+) -> TrainingState:
+    return init_seeds((keys, networks, episodes, first), groups, data, n_demos)[1]
+
+
+def _init_seed(
+    trainer: Trainer,
+    seed: tuple[jax.Array, Any, DemonstrationSubset | None, Any],
+    data: HotStartData | None,
+    n_demos: int,
+) -> tuple[Any, TrainingState]:
+    """One seed's state, as the output of a step that leaves the seed's arguments as they are."""
+    key, networks, episodes, first = seed
+    data = None if data is None else data._replace(episodes=episodes)
+    return seed, trainer.init(key, data, n_demos, networks, first)
+
+
+def _permute(state: TrainingState, move: np.ndarray) -> TrainingState:
+    return jax.tree.map(lambda leaf: leaf[move], state)
 
 
 def begin(
@@ -269,35 +281,24 @@ def compiler(
         `(method, settings, seeds) -> CompiledMethod`. The group depends on these seeds alone, and
         so do a cell's numbers, whatever else is trained beside it.
     """
-
     on_host = isinstance(env, HostEnv)
     # Cells follow each other, and share the sub-environments that they train in.
     vectors = [host.Latest(env.vector) for _ in devices] if isinstance(env, HostEnv) else None
 
-    def group_of(architecture: Architecture, count: int) -> int:
-        # One step of a task on the host is too short for groups to pay off.
-        if on_host:
-            return -(-count // len(devices))
-        return group or seeds.group_size(count, len(devices), architecture.hidden)
-
-    @functools.cache
-    def evaluator(architecture: Architecture, group: int) -> Evaluator:
-        if isinstance(env, HostEnv):
-            return host.evaluator(env, architecture, gather)
-        return evaluator_lib.of_networks(env, architecture, group, devices, gather)
-
-    @functools.cache
-    def draw_networks(architecture: Architecture, group: int) -> Callable:
-        return compile_networks(env, architecture, group, devices)
-
-    @functools.cache
-    def hot_start(settings: Settings, group: int) -> Callable:
-        return compile_hot_start(env, settings, subset_size, group, devices)
+    # What methods share.
+    evaluator = functools.cache(functools.partial(_evaluator, env, devices, gather))
+    draw_networks = functools.cache(functools.partial(compile_networks, env, devices))
+    hot_start = functools.cache(functools.partial(compile_hot_start, env, devices, subset_size))
 
     @functools.cache
     def compile_once(method: Method, settings: Settings, count: int) -> CompiledMethod:
         architecture = settings.architecture
-        size = group_of(architecture, count)
+        size = group
+        if on_host:
+            # One step of a task on the host is too short for groups to pay off.
+            size = -(-count // len(devices))
+        elif size is None:
+            size = seeds.group_size(count, len(devices), architecture.hidden)
         return compile_method(
             env,
             method,
@@ -314,3 +315,15 @@ def compiler(
         )
 
     return compile_once
+
+
+def _evaluator(
+    env: Env | HostEnv,
+    devices: Sequence[Any],
+    gather: Callable[[Any], Any],
+    architecture: Architecture,
+    group: int,
+) -> Evaluator:
+    if isinstance(env, HostEnv):
+        return host.evaluator(env, architecture, gather)
+    return evaluator_lib.of_networks(env, architecture, group, devices, gather)

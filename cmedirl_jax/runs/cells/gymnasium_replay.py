@@ -15,14 +15,14 @@ STARTS = 3
 """Start states per policy."""
 
 
-class Replay(NamedTuple):
+class ReplayedReturns(NamedTuple):
     """Returns of the same episodes in the two environments, `[seeds, STARTS]` each."""
 
     gymnasium_return: np.ndarray
     jax_return: np.ndarray
 
 
-def replay(evaluator: Evaluator, actors: Any, env: Env | HostEnv) -> Replay | None:
+def replay(evaluator: Evaluator, actors: Any, env: Env | HostEnv) -> ReplayedReturns | None:
     """Run each seed's policy `[seeds, ...]` from the same starts in both environments.
 
     None where the task is Gymnasium's own, or does not say what Gymnasium's state is.
@@ -31,7 +31,8 @@ def replay(evaluator: Evaluator, actors: Any, env: Env | HostEnv) -> Replay | No
         return None
     jax_return = evaluator.gather(evaluator.on_starts(actors, STARTS).episode_return)
     act = jax.jit(jax.vmap(evaluator.act))
-    return Replay(_run(lambda observations: act(actors, observations), actors, env), jax_return)
+    gymnasium_return = _run(lambda observations: act(actors, observations), actors, env)
+    return ReplayedReturns(gymnasium_return, jax_return)
 
 
 def _run(act: Callable[[jax.Array], jax.Array], actors: Any, env: Env) -> np.ndarray:

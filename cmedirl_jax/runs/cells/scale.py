@@ -92,13 +92,13 @@ def random_return(env: Env | HostEnv, starts: int) -> float:
     """The mean return of random actions from the evaluation starts."""
     if isinstance(env, HostEnv):
         return _random_on_host(env, starts)[0]
-    drawing, params = _drawing(env), env.default_params
+    random_env, params = _with_random_actions(env), env.default_params
 
     @jax.jit
     def run(key: jax.Array) -> jax.Array:
         return evaluation.rollout(
             lambda observations: jnp.zeros((starts, env.spec.action_dim)),
-            drawing,
+            random_env,
             params,
             env.starts(starts, params),
             key,
@@ -132,13 +132,14 @@ def _random_spread(env: Env) -> float:
         del actor
         return jnp.zeros((*observations.shape[:-1], env.spec.action_dim))
 
-    record = jax.jit(lambda key: recording.record(act, _drawing(env), None, key, EPISODES))
+    random_env = _with_random_actions(env)
+    record = jax.jit(lambda key: recording.record(act, random_env, None, key, EPISODES))
     transition, running, _ = jax.device_get(record(jax.random.key(1)))
     return float(np.std(transition.reward[running]))
 
 
-def _drawing(env: Env) -> Env:
-    """The task, which draws an action of its own in place of the one that it is given."""
+def _with_random_actions(env: Env) -> Env:
+    """The task with an action that it draws uniformly in place of the one that it is given."""
     spec = env.spec
 
     def step(key: jax.Array, state: Any, action: jax.Array, params: Any) -> tuple[Any, Step]:

@@ -16,7 +16,7 @@ from cmedirl_jax.runs.loggers.base import Logger, Point, Writer
 from cmedirl_jax.runs.loggers.registry import LOGGERS
 
 
-class Log:
+class CellLog:
     """Logs a cell while it trains; leaving the context waits until everything is written.
 
     The log begins afresh whenever the cell's training is started, and a cell that goes on from a
@@ -53,7 +53,7 @@ class Log:
         self._evaluations: queue.SimpleQueue[EvaluationRows | None] = queue.SimpleQueue()
         self._followed = 0
 
-    def __enter__(self) -> "Log":
+    def __enter__(self) -> "CellLog":
         if self._outlets:
             self._thread.start()
         return self

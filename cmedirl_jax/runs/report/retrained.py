@@ -39,7 +39,7 @@ MEASURES = {
 """What is measured, in words."""
 
 
-class Plan(NamedTuple):
+class Retraining(NamedTuple):
     """What to retrain.
 
     Attributes:
@@ -55,7 +55,9 @@ class Plan(NamedTuple):
     devices: Sequence[Any]
 
 
-def plan(env: Env | HostEnv, steps: int, changes: Sequence[str], devices: Sequence[Any]) -> Plan:
+def plan(
+    env: Env | HostEnv, steps: int, changes: Sequence[str], devices: Sequence[Any]
+) -> Retraining:
     """Check what a user asks for.
 
     Args:
@@ -73,7 +75,9 @@ def plan(env: Env | HostEnv, steps: int, changes: Sequence[str], devices: Sequen
     if steps % EVALUATIONS:
         raise UserError(f"--retrain: {steps} is no multiple of {EVALUATIONS}, the evaluations")
     own = env.default_params
-    return Plan(env, steps, {OWN: own} | {name: _changed(own, name) for name in changes}, devices)
+    return Retraining(
+        env, steps, {OWN: own} | {name: _changed(own, name) for name in changes}, devices
+    )
 
 
 def _changed(params: Any, change: str) -> Any:
@@ -117,7 +121,9 @@ class _Frozen(NamedTuple):
     size: np.ndarray
 
 
-def of_run(run: RewardedRun, plan: Plan, say: Callable[[str], None]) -> Iterator[pl.DataFrame]:
+def of_run(
+    run: RewardedRun, plan: Retraining, say: Callable[[str], None]
+) -> Iterator[pl.DataFrame]:
     """Train agents on r_e, on random networks and constants, and on each learned reward in turn.
 
     All but r_e are scaled to one root mean square over the steps that demonstrations and policies
@@ -191,7 +197,7 @@ def _size(rewards: Rewards, steps: Transition) -> np.ndarray:
 
 
 def _program(
-    plan: Plan, settings: Settings, pay: Callable[..., jax.Array] | None
+    plan: Retraining, settings: Settings, pay: Callable[..., jax.Array] | None
 ) -> Callable[..., Evaluation]:
     """Trains agents on rewards of one function: `((keys, (scale, params))) -> Evaluation`."""
     physics = jax.tree.map(lambda *leaves: np.stack(leaves), *plan.physics.values())
@@ -218,7 +224,7 @@ def _program(
 
 def _rows(
     context: Context,
-    plan: Plan,
+    plan: Retraining,
     train: Callable[..., Evaluation],
     params: Any,
     seeds: np.ndarray,

@@ -33,6 +33,8 @@ CAPTIONS = {
     "others are scaled to one root mean square.",
 }
 """What is written below each picture, in the page's order."""
+AGENTS_FILE = "retraining.parquet"
+"""The evaluations of fresh agents."""
 
 
 class RewardReport(NamedTuple):
@@ -56,7 +58,7 @@ class RewardReport(NamedTuple):
 def write(
     run: Run,
     rewarded: RewardedRun,
-    plan: retrained.Plan | None,
+    plan: retrained.Retraining | None,
     say: Callable[[str], None],
     complain: Callable[[str], None],
 ) -> RewardReport:
@@ -72,56 +74,76 @@ def write(
     Raises:
         OSError: if a file cannot be written.
     """
-    to, seeds = run.folder / run_folder.REWARD, run.tables["seeds"]
+    folder = run.folder / run_folder.REWARD
+    report, figures = _assess(run, rewarded, folder)
+    if plan is not None:
+        _retrain(rewarded, plan, folder / AGENTS_FILE, say)
+    if (folder / AGENTS_FILE).is_file():
+        report, figures["retraining"] = _add_agents(report, run, rewarded, folder)
+    pictures = {
+        name: folder / f"{name}.png"
+        for name, figure in figures.items()
+        if drawing.save(figure, [folder / f"{name}.png", folder / f"{name}.svg"], complain)
+    }
+    outputs.write(folder / "report.html", _page(run, report, pictures).encode())
+    return report
 
-    # Each reward beside the task's, beside demonstrations, and beside those of other seeds.
+
+def _assess(
+    run: Run, rewarded: RewardedRun, folder: Path
+) -> tuple[RewardReport, dict[str, Callable[[], Figure]]]:
+    """Put each reward beside the task's, demonstrations and other seeds'; write the tables.
+
+    Returns:
+        What was found, and the figures by name, not drawn yet.
+    """
+    seeds = run.tables["seeds"]
     agreement = reward_agreement.of_run(rewarded)
     rows = reward_cards.of_run(rewarded).join(reward_agreement.rows(agreement), on=LEARNER)
     importances = reward_slices.importances(rewarded)
     learners = reward_diagnostics.of_learners(rows, run.tables["evaluations"])
-    outputs.write_table(to / "seeds.parquet", rows)
-    outputs.write_table(to / "diagnostics.parquet", learners)
+    outputs.write_table(folder / "seeds.parquet", rows)
+    outputs.write_table(folder / "diagnostics.parquet", learners)
     report = RewardReport(
         rows,
-        _csv(to / "summary.csv", reward_cards.summarise(rows, seeds)),
-        _csv(to / "diagnostics.csv", reward_diagnostics.correlations(learners)),
+        _csv(folder / "summary.csv", reward_cards.summarise(rows, seeds)),
+        _csv(folder / "diagnostics.csv", reward_diagnostics.correlations(learners)),
     )
     names = {name: name for name in reward_slices.inputs(rewarded.context.env)}
-    _csv(to / "importance.csv", reward_cards.summarise(importances, seeds, names))
+    _csv(folder / "importance.csv", reward_cards.summarise(importances, seeds, names))
     figures: dict[str, Callable[[], Figure]] = {
         "slices": reward_slices.figure(rewarded, importances),
         "agreement": functools.partial(reward_agreement.figure, agreement),
     }
     if (maps := reward_maps.of_run(rewarded)) is not None:
         figures["maps"] = maps
+    return report, figures
 
-    # Fresh agents.
-    agents = to / "retraining.parquet"
-    if plan is not None:
-        # Written after each reward: a command that is stopped keeps those that are done.
-        trained: list[pl.DataFrame] = []
-        for table in retrained.of_run(rewarded, plan, say):
-            trained.append(table)
-            outputs.write_table(agents, pl.concat(trained))
-    if agents.is_file():
-        evaluations = pl.read_parquet(agents)
-        measured = retrained.measured(evaluations)
-        summary = reward_cards.summarise(measured, seeds, retrained.MEASURES)
-        report = report._replace(
-            retraining=_csv(to / "retraining.csv", summary),
-            outdated=_outdated(rows, evaluations),
-        )
-        threshold = rewarded.context.env.spec.reward_threshold
-        figures["retraining"] = functools.partial(retrained.figure, evaluations, seeds, threshold)
 
-    # Pictures and page.
-    pictures = {
-        name: to / f"{name}.png"
-        for name, figure in figures.items()
-        if drawing.save(figure, [to / f"{name}.png", to / f"{name}.svg"], complain)
-    }
-    outputs.write(to / "report.html", _page(run, report, pictures).encode())
-    return report
+def _retrain(
+    rewarded: RewardedRun, plan: retrained.Retraining, path: Path, say: Callable[[str], None]
+) -> None:
+    """Train fresh agents, and write their evaluations to `path`."""
+    # Written after each reward: a command that is stopped keeps those that are done.
+    trained: list[pl.DataFrame] = []
+    for table in retrained.of_run(rewarded, plan, say):
+        trained.append(table)
+        outputs.write_table(path, pl.concat(trained))
+
+
+def _add_agents(
+    report: RewardReport, run: Run, rewarded: RewardedRun, folder: Path
+) -> tuple[RewardReport, Callable[[], Figure]]:
+    """The report with what the fresh agents in `folder` achieve, and its figure."""
+    evaluations, seeds = pl.read_parquet(folder / AGENTS_FILE), run.tables["seeds"]
+    measured = retrained.measured(evaluations)
+    summary = reward_cards.summarise(measured, seeds, retrained.MEASURES)
+    report = report._replace(
+        retraining=_csv(folder / "retraining.csv", summary),
+        outdated=_outdated(report.rows, evaluations),
+    )
+    threshold = rewarded.context.env.spec.reward_threshold
+    return report, functools.partial(retrained.figure, evaluations, seeds, threshold)
 
 
 def _outdated(rows: pl.DataFrame, evaluations: pl.DataFrame) -> str | None:

@@ -9,7 +9,7 @@ import polars as pl
 import polars.selectors as cs
 
 from cmedirl_jax.runs.cells.cell import CellResult
-from cmedirl_jax.runs.cells.gymnasium_replay import Replay
+from cmedirl_jax.runs.cells.gymnasium_replay import ReplayedReturns
 from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.cells.record import Means
 from cmedirl_jax.runs.errors import UserError
@@ -24,7 +24,7 @@ def rows(
     key: CellKey,
     *,
     best_return: np.ndarray,
-    replay: Replay | None,
+    replay: ReplayedReturns | None,
     pool: LearnersPool | None,
 ) -> dict[str, pl.DataFrame]:
     """The rows of a finished cell in each table.
@@ -33,7 +33,7 @@ def rows(
         result: the cell.
         key: which cell it is.
         best_return: `[seeds]`, of each seed's best policy on fresh starts.
-        replay: of the same policies; None where there is none.
+        replay: returns of the same policies in Gymnasium and in JAX; None where there is none.
         pool: of the demonstrations; None for a method without.
     """
     labels = [
@@ -94,7 +94,7 @@ def _seeds(
     result: CellResult,
     key: CellKey,
     best_return: np.ndarray,
-    replay: Replay | None,
+    replay: ReplayedReturns | None,
     pool: LearnersPool | None,
 ) -> pl.DataFrame:
     episodes, count = result.episodes, len(result.env_steps)

@@ -33,10 +33,10 @@ def test_actions_are_drawn_within_their_bounds():
         seen.append(action)
         return PENDULUM.step(key, state, action, params)
 
-    drawing = scale._drawing(PENDULUM._replace(step=step))
+    random_env = scale._with_random_actions(PENDULUM._replace(step=step))
     state, _ = PENDULUM.reset(jax.random.key(0), PENDULUM.default_params)
     for seed in range(200):
-        drawing.step(jax.random.key(seed), state, jnp.zeros(1), PENDULUM.default_params)
+        random_env.step(jax.random.key(seed), state, jnp.zeros(1), PENDULUM.default_params)
     drawn = np.array(seen)
     assert np.abs(drawn).max() <= 2.0
     assert np.abs(drawn).max() > 1.9

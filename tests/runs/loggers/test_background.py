@@ -7,7 +7,7 @@ import pytest
 
 from cmedirl_jax.runs import intervals
 from cmedirl_jax.runs.errors import Interrupted
-from cmedirl_jax.runs.loggers.background import Log
+from cmedirl_jax.runs.loggers.background import CellLog
 from cmedirl_jax.runs.loggers.base import Logger
 from cmedirl_jax.runs.loggers.registry import LOGGERS
 from tests.support import logs
@@ -47,7 +47,7 @@ def logger(monkeypatch):
 
 
 def log(folder, *loggers, seeds=range(2), each_seed=False, experts=None):
-    return Log(folder, loggers, seeds, each_seed=each_seed, experts=experts, config={})
+    return CellLog(folder, loggers, seeds, each_seed=each_seed, experts=experts, config={})
 
 
 def written(folder):

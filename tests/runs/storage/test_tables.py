@@ -4,7 +4,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from cmedirl_jax.runs.cells.cell import CellResult
-from cmedirl_jax.runs.cells.gymnasium_replay import Replay
+from cmedirl_jax.runs.cells.gymnasium_replay import ReplayedReturns
 from cmedirl_jax.runs.cells.pools import LearnersPool
 from cmedirl_jax.runs.cells.record import EpisodeRows, EvaluationRows, Means
 from cmedirl_jax.runs.storage import tables
@@ -84,7 +84,7 @@ def rows(episodes, first_seed=0, experts=experts):
         result,
         CellKey(7, "best", "hs-ddpg", 10, first_seed, 3),
         best_return=np.array([93.0, 94.0, 95.0]),
-        replay=Replay(
+        replay=ReplayedReturns(
             np.array([[1.0, 2.0, 3.0]] * 3), np.array([[1, 2, 3], [1, 2.5, 2.75], [0, 2, 3]])
         ),
         pool=pool,
