@@ -1,4 +1,4 @@
-"""The range of a number, written beside the field that holds it.
+"""What a field of a settings class may hold, written beside it: ranges of numbers, choices.
 
 A settings class annotates a field with one of the types below, or with `Annotated` and a `Range`:
 
@@ -6,14 +6,15 @@ A settings class annotates a field with one of the types below, or with `Annotat
         batch_size: Size = 32
         seed: Annotated[int, Range(0, 2**32 - 1, "between 0 and 2^32 - 1")] = 0
 
-`check` reads these annotations. Numbers and arrays on the host are checked; traced ones pass.
+`check` reads these annotations, and `Literal`. Numbers and arrays on the host are checked; traced
+ones pass.
 """
 
 import dataclasses
 import functools
 import typing
 from collections.abc import Iterator
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -60,13 +61,13 @@ BelowOne = Annotated[float, BELOW_ONE]
 
 
 def check(settings: Any) -> None:
-    """Refuse numbers out of their range.
+    """Refuse numbers out of their range, and strings that are none of the choices.
 
     Args:
-        settings: a dataclass; its numbers and nested dataclasses are checked.
+        settings: a dataclass; its numbers, strings and nested dataclasses are checked.
 
     Raises:
-        ValueError: naming the first number that is out of range, what it must be and what it is.
+        ValueError: naming the first field that is wrong, what it must be and what it is.
         TypeError: for a number whose field has no range.
     """
     for name, wrong in out_of_range(settings):
@@ -74,23 +75,26 @@ def check(settings: Any) -> None:
 
 
 def out_of_range(settings: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the dotted name of each number that is out of its range, and what is wrong with it.
+    """Yield the dotted name of each field that `check` refuses, and what is wrong with it.
 
     Raises:
         TypeError: for a number whose field has no range.
     """
+    choices = _choices_of(type(settings))
     for field, interval in of_fields(type(settings)).items():
         name, value = prefix + field, getattr(settings, field)
         if dataclasses.is_dataclass(value):
             yield from out_of_range(value, f"{name}.")
             continue
-        # In a tuple, each number is checked.
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, bool) or not isinstance(number, _NUMBERS):
+        # In a tuple, each part is checked.
+        for part in value if isinstance(value, tuple) else (value,):
+            if isinstance(part, str) and part not in (choices[field] or {part}):
+                yield name, f"must be one of {', '.join(choices[field])}, got {part!r}"
+            if isinstance(part, bool) or not isinstance(part, _NUMBERS):
                 continue
             if interval is None:
                 raise TypeError(f"{name} has no range: annotate its field with one")
-            if wrong := complaint(interval, number):
+            if wrong := complaint(interval, part):
                 yield name, wrong
 
 
@@ -122,6 +126,23 @@ def of_fields(settings: type) -> dict[str, Range | None]:
         field.name: next(_ranges_in(hints[field.name]), None)
         for field in dataclasses.fields(settings)
     }
+
+
+@functools.cache
+def _choices_of(settings: type) -> dict[str, tuple[str, ...]]:
+    """The strings that each field of a dataclass may hold; none where it may hold any."""
+    hints = typing.get_type_hints(settings)
+    return {
+        field.name: tuple(_choices_in(hints[field.name])) for field in dataclasses.fields(settings)
+    }
+
+
+def _choices_in(annotation: Any) -> Iterator[str]:
+    if typing.get_origin(annotation) is Literal:
+        yield from typing.get_args(annotation)
+        return
+    for part in typing.get_args(annotation):
+        yield from _choices_in(part)
 
 
 def _ranges_in(annotation: Any) -> Iterator[Range]:

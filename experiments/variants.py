@@ -1,8 +1,11 @@
-"""`python -m experiments.variants --demos POOL`: one change at a time, against what it changes.
+"""`python -m experiments.variants`: one change of the settings at a time, against what it changes.
 
 Each variant is a run of `run_grid` with the same demonstrations and seeds as its base, so that they
 are compared seed by seed; p-values are Holm's over the whole table. The deviation of r_D over the
 replay stands beside every row: a variant with a smaller reward is not a worse one.
+
+With `--demos POOL` alone the changes are the study's. `--base` and `--changes` make others, of any
+task: --base="--env Pendulum-v1 --methods me-ddpg" --changes reward.bound=0.1 reward.bound=1.
 """
 
 import dataclasses
@@ -22,6 +25,7 @@ from cmedirl_jax.runs import paired
 from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
+from cmedirl_jax.runs.storage import demonstrations as stored_demonstrations
 from cmedirl_jax.runs.storage import outputs
 from experiments import measures, pooled, run_grid
 from experiments.measures import AREA, FINAL, STABLE, STEPS, Measure
@@ -95,17 +99,24 @@ VARIANTS = (
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Whose demonstrations, how many seeds, and where the runs go.
+    """What is changed, whose demonstrations, how many seeds, and where the runs go.
 
     Attributes:
+        base: Options of `run_grid`, among them one method, that all changes share: with an equals
+            sign, --base="--env Pendulum-v1 --methods me-ddpg".
+        changes: Options that one variant of the base has, each NAME=VALUE, several with commas:
+            reward.bound=0.1 agent.discount=0.95,exploration.kind=gaussian. Default: the study's.
         demos: A demonstrations file that all runs learn from, such as the pool of another run.
+            Default, for changes of your own: those of the experts that the base's run trains.
         out: A folder; each variant has its run in a folder of its own there.
-        only: Variants to run, with their bases; default all.
+        only: Variants of the study to run, with their bases; default all.
         seeds: Learners of each run.
         csv: A CSV file for the table.
     """
 
-    demos: Path
+    base: str = ""
+    changes: tuple[str, ...] = ()
+    demos: Path | None = None
     out: Path = Path("results/variants")
     only: tuple[str, ...] = ()
     seeds: Size = 32
@@ -117,18 +128,49 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code, that of the first run that does not end well."""
     options = read(Options, "experiments.variants", __doc__, arguments)
     outputs.check("csv", options.csv)
-    chosen = chosen_of(options.only)
+    chosen = variants_of(options)
+    # Refuse a wrong option of any before the first is run.
     for variant in chosen:
-        common = ["--demos", str(options.demos), "--seeds", str(options.seeds)]
-        out = ["--out", str(options.out / variant.name)]
-        code = run_grid.main([*common, *out, *shlex.split(variant.options)])
+        config = run_grid.parse(shlex.split(variant.options))
+        if len(config.methods) * len(config.n_demos) != 1:
+            raise UserError("--base: needs one method, and one number of demonstrations")
+    pool = options.demos
+    for variant in chosen:
+        folder = options.out / variant.name
+        demos = [] if pool is None else ["--demos", str(pool)]
+        common = [*demos, "--seeds", str(options.seeds), "--out", str(folder)]
+        code = run_grid.main([*common, *shlex.split(variant.options)])
         if code:
             return code
+        kept = folder / stored_demonstrations.FOLDER / stored_demonstrations.FILE
+        pool = kept if pool is None and kept.exists() else pool
     table = compare(options.out, chosen)
     screen.show(screen.console(), shown(table))
     if options.csv is not None:
         outputs.write(options.csv, table.write_csv().encode())
     return 0
+
+
+def variants_of(options: Options) -> list[Variant]:
+    """The variants that the options ask for, each after its base.
+
+    Raises:
+        UserError: for options that do not go together, as `chosen_of`.
+    """
+    if not options.changes and not options.base:
+        if options.demos is None:
+            raise UserError("--demos: the study's variants need the demonstrations of a run")
+        return chosen_of(options.only)
+    if not options.changes or not options.base or options.only:
+        raise UserError("--base and --changes go together, and without --only")
+    base = Variant("base", options.base)
+    # A change named twice is run once.
+    return [base, *(_changed(base, change) for change in dict.fromkeys(options.changes))]
+
+
+def _changed(base: Variant, change: str) -> Variant:
+    options = (f"--{' '.join(option.split('=', 1))}" for option in change.split(","))
+    return Variant(change.replace("/", "-"), " ".join((base.options, *options)), base.name)
 
 
 def chosen_of(names: Sequence[str]) -> list[Variant]:

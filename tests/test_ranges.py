@@ -1,5 +1,6 @@
 import dataclasses
 import math
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +46,20 @@ def test_a_range_holds_its_ends_and_nothing_beyond_or_undefined(name):
         assert name == "number"
         assert what.endswith(f", got {outside}")
     assert wrong(math.nan) == [("number", f"must be {interval.words}, got nan")]
+
+
+def test_a_string_that_is_none_of_the_choices_is_refused():
+    fruit = Literal["apple", "pear"]
+    basket = dataclasses.make_dataclass(
+        "Basket",
+        [("one", fruit), ("some", tuple[fruit, ...]), ("none", fruit | None), ("any", str)],
+    )
+    assert not list(ranges.out_of_range(basket("pear", ("apple",), None, "plum")))
+    assert list(ranges.out_of_range(basket("plum", ("apple", "fig"), "nut", ""))) == [
+        ("one", "must be one of apple, pear, got 'plum'"),
+        ("some", "must be one of apple, pear, got 'fig'"),
+        ("none", "must be one of apple, pear, got 'nut'"),
+    ]
 
 
 def test_a_range_is_found_in_optional_fields_and_in_tuples():

@@ -12,7 +12,7 @@ LIBRARY = ROOT / "cmedirl_jax"
 TOP = (
     *("types", "checks", "ranges", "rounding", "registries"),
     *("networks", "normalisation", "observation_statistics"),
-    *("products", "hyperparameters", "optimizers", "grids", "modes"),
+    *("products", "hyperparameters", "optimizers", "grids", "modes", "compilation"),
 )
 ROOMS = (
     *("io", "envs", "data", "agents", "irl", "tabular", "training", "assess"),

@@ -74,7 +74,7 @@ def _say_what_was_assumed(
     console: Console, config: StudyConfig, plan: Plan, n_demos_assumed: bool
 ) -> None:
     if tasks.found(config.env) is None:
-        said = f"{config.env} has no settings of its own: the car's, see docs/tasks.md"
+        said = f"{config.env} has no settings of its own: the car's, see docs/tuning.md"
         screen.say(console, said)
     if n_demos_assumed and plan.demos is not None and any(n_demos for _, n_demos in plan.asked):
         held, drawn = pools.held(plan.demos), plan.subset_size

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from cmedirl_jax import observation_statistics
+from cmedirl_jax import compilation, observation_statistics
 from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.envs import Step, stepping
 from cmedirl_jax.training import initialise
@@ -91,14 +91,14 @@ def compile_halves(trainer: Trainer, max_episode_steps: int) -> Halves:
 
     learn_all = spread(learn)
     return Halves(
-        behave=jax.jit(spread(behave)),
-        learn=jax.jit(
+        behave=compilation.jit(spread(behave)),
+        learn=compilation.jit(
             lambda states, answered, *shared: learn_all((states, *answered), *shared),
             donate_argnums=0,
         ),
         first_seeds=jax.jit(spread(first_reset_seed)),
         seeds=jax.jit(spread(reset_seed)),
-        begin_episode=jax.jit(spread(begin_episode)),
+        begin_episode=compilation.jit(spread(begin_episode)),
         max_episode_steps=max_episode_steps,
     )
 

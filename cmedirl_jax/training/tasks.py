@@ -1,7 +1,7 @@
 """Settings that work on each task: those of `tuned`, of its experts, and for how long they train.
 
 A task that is not in `TASKS` has the settings of MountainCarContinuous-v0, which is a guess; how to
-find better ones is in docs/tasks.md. Add your own by `TASKS[name] = TaskSettings(...)`; which
+find better ones is in docs/tuning.md. Add your own by `TASKS[name] = TaskSettings(...)`; which
 settings they are is part of a run's configuration.
 """
 
@@ -33,7 +33,7 @@ class TaskSettings:
     expert_steps: int = 14_000
 
 
-# The bounds of r_D are the best of 0.02, 0.1, 0.3, 1 and 3 on 16 seeds (docs/tasks.md).
+# The bounds of r_D are the best of 0.02, 0.1, 0.3, 1 and 3 on 16 seeds (docs/tuning.md).
 _LARGER_REWARD = Settings(reward=IRLHParams(bound=0.3))
 
 # The noise that the car needs would fell the pole at once; returns of 1,000 are scaled to 100.

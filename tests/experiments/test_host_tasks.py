@@ -205,6 +205,6 @@ def test_experts_of_a_task_without_settings_train_as_its_learners_do():
 
 def test_what_the_run_says_of_its_settings_and_experts(run):
     output = " ".join((run.parent / "said.txt").read_text().split())
-    assert "Dock-v0 has no settings of its own: the car's, see docs/tasks.md" in output
+    assert "Dock-v0 has no settings of its own: the car's, see docs/tuning.md" in output
     assert re.search(r"\d of 3 experts solve the task; \d demonstrate for 3 learners", output)
     assert "No episode was repeated" not in output

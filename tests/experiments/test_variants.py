@@ -1,7 +1,9 @@
+import shlex
+
 import polars as pl
 import pytest
 
-from experiments import variants
+from experiments import run_grid, variants
 from experiments.variants import VARIANTS, Variant
 from tests.support import curves
 
@@ -46,22 +48,17 @@ def test_a_variant_brings_its_base():
     assert variants.chosen_of([]) == list(VARIANTS)
 
 
-@pytest.mark.parametrize("variant", [one for one in VARIANTS if one.base], ids=lambda one: one.name)
-def test_the_options_of_a_variant_are_run_grids(variant, monkeypatch):
-    parsed = []
+def test_every_variant_changes_the_settings_of_its_base():
+    settings = {}
+    for variant in VARIANTS:
+        settings[variant.name] = run_grid.parse(shlex.split(variant.options)).settings
+        assert not variant.base or settings[variant.name] != settings[variant.base]
 
-    def ending_with(code):
-        return lambda _, config, *args, **options: parsed.append(config.settings) or code
 
-    monkeypatch.setattr("experiments.run_grid.execute", ending_with(3))
-    code = variants.main(["--demos", "pool.npz", "--only", variant.name])
-    assert code == 3
-    monkeypatch.setattr("experiments.run_grid.execute", ending_with(0))
-    monkeypatch.setattr(variants, "compare", lambda *_: pl.DataFrame())
-    monkeypatch.setattr(variants, "shown", lambda table: "")
-    assert variants.main(["--demos", "pool.npz", "--only", variant.name]) == 0
-    *_, base, changed = parsed
-    assert base != changed
+def test_a_run_that_fails_ends_the_command_with_its_code(monkeypatch):
+    codes = iter([0, 3])
+    monkeypatch.setattr("experiments.run_grid.execute", lambda *args, **options: next(codes))
+    assert variants.main(["--demos", "pool.npz", "--only", "gail-throughout", "gail-log-d"]) == 3
 
 
 def test_an_unknown_variant_is_refused_in_a_line(capsys):
@@ -69,3 +66,36 @@ def test_an_unknown_variant_is_refused_in_a_line(capsys):
     error = capsys.readouterr().err
     assert error.startswith("variants: --only: there is no variant 'everything'; there are me-ddpg")
     assert error.count("\n") == 1
+
+
+def test_changes_of_ones_own_are_variants_of_ones_own_base(monkeypatch):
+    run = []
+    monkeypatch.setattr(
+        "experiments.run_grid.execute", lambda _, config, *args, **options: run.append(config) or 0
+    )
+    monkeypatch.setattr(variants, "compare", lambda *_: pl.DataFrame())
+    monkeypatch.setattr(variants, "shown", lambda table: "")
+    base = "--base=--env Pendulum-v1 --methods me-ddpg"
+    changes = ["reward.bound=0.5", "agent.discount=0.9,reward-schedule.stop=None"]
+    assert variants.main([base, "--seeds", "4", "--changes", *changes]) == 0
+    assert [config.env for config in run] == ["Pendulum-v1"] * 3
+    assert [config.out.name for config in run] == ["base", *changes]
+    first, bound, two = (config.settings for config in run)
+    assert bound.reward.bound == 0.5
+    assert first.reward.bound != 0.5
+    assert (two.agent.discount, two.reward_schedule.stop) == (0.9, None)
+    assert two.reward == first.reward
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "--demos: the study's variants need"),
+        (["--changes", "reward.bound=1"], "--base and --changes go together"),
+        (["--base=--methods ddpg"], "--base and --changes go together"),
+        (["--base=--n-demos 5", "--changes", "reward.bound=1"], "--base: needs one method"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(arguments, message, capsys):
+    assert variants.main(arguments) == 2
+    assert message in capsys.readouterr().err

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from cmedirl_jax import training
+from cmedirl_jax import compilation, training
 from cmedirl_jax.agents.hot_start import HotStartData
 from cmedirl_jax.envs import Env, HostEnv
 from cmedirl_jax.networks import Architecture
@@ -74,7 +74,7 @@ def compile_networks(
     def draw(keys: jax.Array, groups: int) -> Any:
         return seeds.map_devices(drawn, devices)(keys, groups)[1]
 
-    return jax.jit(draw, out_shardings=seeds.sharding(devices))
+    return compilation.jit(draw, out_shardings=seeds.sharding(devices))
 
 
 def compile_hot_start(
@@ -102,7 +102,7 @@ def compile_hot_start(
         spread = seeds.map_devices(seeds.step_groups(of_seed, group), devices)
         return spread((keys, networks, episodes), groups, data, n_demos)[1]
 
-    return _Latest(jax.jit(fit, out_shardings=seeds.sharding(devices)))
+    return _Latest(compilation.jit(fit, out_shardings=seeds.sharding(devices)))
 
 
 class _Latest:
@@ -164,12 +164,12 @@ def compile_method(
         first, run, resume = steps.first, steps.run, steps.resume
     else:
         first, resume = lambda keys: None, lambda state, step: state
-        run = jax.jit(spread(trainer.run), donate_argnums=0, out_shardings=split)
+        run = compilation.jit(spread(trainer.run), donate_argnums=0, out_shardings=split)
     init = functools.partial(_init, spread(functools.partial(_init_seed, trainer)))
     return CompiledMethod(
         draw_networks=draw_networks,
         hot_start=hot_start,
-        init=jax.jit(init, out_shardings=split),
+        init=compilation.jit(init, out_shardings=split),
         first=first,
         run=run,
         resume=resume,

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import networks
+from cmedirl_jax import compilation, networks
 from cmedirl_jax.envs import Env
 from cmedirl_jax.networks import Architecture
 from cmedirl_jax.runs.cluster.base import ALONE
@@ -80,7 +80,7 @@ def make(
     def one(actor: Any, starts: Any) -> tuple[Any, Rollouts]:
         return actor, evaluation.rollout(functools.partial(act, actor), env, params, starts)
 
-    @jax.jit
+    @compilation.jit
     def spread(actors: Any, starts: Any, groups: int | None = None) -> Rollouts:
         # Copies of the first seed fill the last group.
         count = jax.tree.leaves(actors)[0].shape[0]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import polars as pl
 
+from cmedirl_jax import compilation
 from cmedirl_jax.assess import retraining
 from cmedirl_jax.assess.card import Rewards
 from cmedirl_jax.envs import Env, HostEnv
@@ -219,7 +220,7 @@ def _program(
             evaluate_every=plan.steps // EVALUATIONS,
         )
 
-    return jax.jit(seeds_lib.map_devices(train, plan.devices))
+    return compilation.jit(seeds_lib.map_devices(train, plan.devices))
 
 
 def _rows(
