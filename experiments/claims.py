@@ -36,7 +36,7 @@ from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
 from cmedirl_jax.runs.report.base import Run, Verdicts
 from cmedirl_jax.runs.storage import outputs
-from experiments import pooled, verdicts
+from experiments import pooled, presets, verdicts
 from experiments.pooled import Pooled
 from experiments.verdicts import Claim
 
@@ -75,9 +75,14 @@ def of_folders(folders: Sequence[Path]) -> str:
     """The page of verdicts.
 
     Raises:
-        UserError: as `pooled.load` and `of_one_page`.
+        UserError: as `pooled.load` and `of_one_page`, and for a run of a task other than the
+            paper's.
     """
-    runs = of_one_page([pooled.load(folder) for folder in folders])
+    loaded = [pooled.load(folder) for folder in folders]
+    for run in loaded:
+        if (env := run.config["env"]) != presets.CAR:
+            raise UserError(f"{run.folder}: {env}; the paper's claims are about {presets.CAR}")
+    runs = of_one_page(loaded)
     return page(runs, verdicts.judge(runs))
 
 
@@ -120,8 +125,10 @@ def page(runs: Sequence[Pooled], claims: Sequence[Claim]) -> str:
     return "\n".join(lines)
 
 
-def verdicts_on(run: Run) -> Verdicts:
-    """The verdicts on one run, for its report."""
+def verdicts_on(run: Run) -> Verdicts | None:
+    """The verdicts on one run, for its report; None for a task that the claims are not about."""
+    if run.config["env"] != presets.CAR:
+        return None
     runs = of_one_page([run])
     judged = verdicts.judge(runs)
     return Verdicts(page(runs, judged), section(judged))

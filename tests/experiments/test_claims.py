@@ -1,7 +1,7 @@
 import pytest
 
 from cmedirl_jax.runs.errors import UserError
-from experiments import claims
+from experiments import claims, pooled
 from experiments.presets import PRESETS
 from experiments.verdicts import Claim, Part
 from tests.support.curves import SEEDS, save, write_config
@@ -37,6 +37,16 @@ def test_runs_of_other_settings_are_not_judged_together(folder, tmp_path):
     save(other, "ddpg", 0, [[0, 20, 95]] * SEEDS)
     with pytest.raises(UserError, match=r"its \S+ is not that of"):
         claims.of_folders([folder, other])
+
+
+def test_a_run_of_another_task_is_not_judged(folder, monkeypatch):
+    run = pooled.load(folder)
+    other = run._replace(config=run.config | {"env": "PointMass-v0"})
+    assert claims.verdicts_on(run) is not None
+    assert claims.verdicts_on(other) is None
+    monkeypatch.setattr(pooled, "load", lambda folder: other)
+    with pytest.raises(UserError, match=r"PointMass-v0; the paper's claims are about Mountain"):
+        claims.of_folders([folder])
 
 
 def test_the_section_of_a_report_has_every_verdict_and_its_evidence():

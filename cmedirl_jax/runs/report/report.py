@@ -13,7 +13,7 @@ from cmedirl_jax.runs.storage import folder as run_folder
 
 
 def write(
-    folder: Path, redraw: bool = False, judge: Callable[[Run], Verdicts] | None = None
+    folder: Path, redraw: bool = False, judge: Callable[[Run], Verdicts | None] | None = None
 ) -> Report:
     """Write the tables, summary, figures and page of the cells of config.json.
 
@@ -23,8 +23,8 @@ def write(
     Args:
         folder: the run's.
         redraw: whether figures that are there are drawn again.
-        judge: concludes from a run whose cells are all finished. It is not asked about single
-            seeds, nor about seeds that are not watched for as long.
+        judge: concludes from a run whose cells are all finished, or has nothing to say of it. It is
+            not asked about single seeds, nor about seeds that are not watched for as long.
 
     Raises:
         UserError: if the folder holds no finished cell of a run, or a damaged one.
@@ -60,9 +60,10 @@ def write(
     verdicts = None
     if judge is not None and whole and config["seeds"] > 1 and not ends.mixed:
         verdicts = judge(run)
-        outputs.write(folder / "claims.md", verdicts.markdown.encode())
-    else:
+    if verdicts is None:
         (folder / "claims.md").unlink(missing_ok=True)
+    else:
+        outputs.write(folder / "claims.md", verdicts.markdown.encode())
     text = page.page(
         config,
         summary,
