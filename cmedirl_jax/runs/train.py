@@ -125,7 +125,8 @@ def session_of(
             devices,
             capacity=plan.capacity,
             subset_size=plan.subset_size,
-            least_slots=0 if plan.demos is not None else plan.experts.seeds,
+            # Blocks of learners must not have the slots of all experts.
+            least_slots=plan.experts.seeds if plan.demos is None and not plan.seeds_at_once else 0,
             group=plan.group,
             gather=cluster.gather,
         ),
@@ -229,7 +230,9 @@ def _train_experts(
 ) -> Demonstrations:
     plan = session.plan
     # In JAX experts are stepped in groups as learners are, and share what is compiled.
-    count = plan.seeds if isinstance(plan.env, Env) else plan.experts.seeds
+    count = plan.experts.seeds
+    if isinstance(plan.env, Env):
+        count = max(plan.seeds_at_once, count) if plan.seeds_at_once else plan.seeds
     return experts.make_pool(
         session.keys.experts,
         plan.env,
