@@ -24,6 +24,10 @@ _FLOAT = np.finfo(np.float32)
 _NUMBERS = (int, float, np.number, np.ndarray, jax.Array)
 
 
+class Registered:
+    """Beside a `Literal`: its choices are a registry's, to which users add."""
+
+
 class Range(NamedTuple):
     """A closed interval. NaN lies outside.
 
@@ -131,13 +135,16 @@ def of_fields(settings: type) -> dict[str, Range | None]:
 @functools.cache
 def _choices_of(settings: type) -> dict[str, tuple[str, ...]]:
     """The strings that each field of a dataclass may hold; none where it may hold any."""
-    hints = typing.get_type_hints(settings)
+    hints = typing.get_type_hints(settings, include_extras=True)
     return {
         field.name: tuple(_choices_in(hints[field.name])) for field in dataclasses.fields(settings)
     }
 
 
 def _choices_in(annotation: Any) -> Iterator[str]:
+    """The choices in an annotation and its parts; none where they are a registry's."""
+    if Registered in getattr(annotation, "__metadata__", ()):
+        return
     if typing.get_origin(annotation) is Literal:
         yield from typing.get_args(annotation)
         return

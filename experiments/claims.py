@@ -31,6 +31,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from cmedirl_jax.envs import registry
 from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
@@ -80,7 +81,8 @@ def of_folders(folders: Sequence[Path]) -> str:
     """
     loaded = [pooled.load(folder) for folder in folders]
     for run in loaded:
-        if (env := run.config["env"]) != presets.CAR:
+        if not _of_the_paper(run):
+            env = run.config["env"]
             raise UserError(f"{run.folder}: {env}; the paper's claims are about {presets.CAR}")
     runs = of_one_page(loaded)
     return page(runs, verdicts.judge(runs))
@@ -127,11 +129,16 @@ def page(runs: Sequence[Pooled], claims: Sequence[Claim]) -> str:
 
 def verdicts_on(run: Run) -> Verdicts | None:
     """The verdicts on one run, for its report; None for a task that the claims are not about."""
-    if run.config["env"] != presets.CAR:
+    if not _of_the_paper(run):
         return None
     runs = of_one_page([run])
     judged = verdicts.judge(runs)
     return Verdicts(page(runs, judged), section(judged))
+
+
+def _of_the_paper(run: Run) -> bool:
+    """Whether its task is the paper's, in JAX or through Gymnasium."""
+    return registry.split_id(run.config["env"])[1] == presets.CAR
 
 
 def section(claims: Sequence[Claim]) -> str:

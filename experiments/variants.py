@@ -104,8 +104,9 @@ class Options:
     Attributes:
         base: Options of `run_grid`, among them one method, that all changes share: with an equals
             sign, --base="--env Pendulum-v1 --methods me-ddpg".
-        changes: Options that one variant of the base has, each NAME=VALUE, several with commas:
-            reward.bound=0.1 agent.discount=0.95,exploration.kind=gaussian. Default: the study's.
+        changes: Options that one variant of the base has, each NAME=VALUE or, for a switch, NAME;
+            several with commas: reward.bound=0.1 agent.discount=0.95,reward.absorbing. A value with
+            a space has quotes of its own: "gail.form='log D'". Default: the study's.
         demos: A demonstrations file that all runs learn from, such as the pool of another run.
             Default, for changes of your own: those of the experts that the base's run trains.
         out: A folder; each variant has its run in a folder of its own there.
@@ -129,17 +130,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = read(Options, "experiments.variants", __doc__, arguments)
     outputs.check("csv", options.csv)
     chosen = variants_of(options)
-    # Refuse a wrong option of any before the first is run.
-    for variant in chosen:
-        config = run_grid.parse(shlex.split(variant.options))
-        if len(config.methods) * len(config.n_demos) != 1:
-            raise UserError("--base: needs one method, and one number of demonstrations")
+    check(chosen)
     pool = options.demos
     for variant in chosen:
         folder = options.out / variant.name
         demos = [] if pool is None else ["--demos", str(pool)]
         common = [*demos, "--seeds", str(options.seeds), "--out", str(folder)]
-        code = run_grid.main([*common, *shlex.split(variant.options)])
+        code = run_grid.main([*shlex.split(variant.options), *common])
         if code:
             return code
         kept = folder / stored_demonstrations.FOLDER / stored_demonstrations.FILE
@@ -166,6 +163,28 @@ def variants_of(options: Options) -> list[Variant]:
     base = Variant("base", options.base)
     # A change named twice is run once.
     return [base, *(_changed(base, change) for change in dict.fromkeys(options.changes))]
+
+
+def check(variants: Sequence[Variant]) -> None:
+    """Refuse options that cannot be read, or that keep seeds from being compared, before any run.
+
+    Raises:
+        UserError: naming the variant.
+    """
+    pairing = {}
+    for variant in variants:
+        try:
+            arguments = shlex.split(variant.options)
+        except ValueError as error:
+            raise UserError(f"{variant.name}: {error}") from error
+        if ours := {"--demos", "--out", "--seeds"}.intersection(arguments):
+            raise UserError(f"{variant.name}: give {ours.pop()} to this command, for all variants")
+        config = run_grid.parse(arguments)
+        if len(config.methods) * len(config.n_demos) != 1:
+            raise UserError(f"{variant.name}: needs one method and one number of demonstrations")
+        pairing[variant.name] = config.env, config.seed
+        if variant.base and pairing[variant.name] != pairing[variant.base]:
+            raise UserError(f"{variant.name}: needs the task and the study seed of its base")
 
 
 def _changed(base: Variant, change: str) -> Variant:

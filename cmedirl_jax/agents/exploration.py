@@ -35,7 +35,9 @@ from cmedirl_jax.ranges import AtLeastOne, NotNegative, Positive, Range, Share
 from cmedirl_jax.registries import Registry
 from cmedirl_jax.types import EnvSpec, Numeric
 
-ExplorationName = Literal["ornstein-uhlenbeck", "gaussian", "epsilon-greedy"]
+ExplorationName = Annotated[
+    Literal["ornstein-uhlenbeck", "gaussian", "epsilon-greedy"], ranges.Registered
+]
 """The names in `EXPLORATIONS`."""
 
 

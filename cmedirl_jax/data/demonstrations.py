@@ -112,7 +112,7 @@ def subset(
 
     Raises:
         ValueError: if the pool holds fewer than `n` (or `size`) episodes, `n` is not a scalar or,
-            where it is known, not between 1 and `size`, or `size` is not positive.
+            where it is no array of JAX's, not between 1 and `size`, or `size` is not positive.
         TypeError: if `n` or `size` is not an integer.
     """
     checks.shape("n", n, ())

@@ -20,17 +20,17 @@ A new objective needs, all in this file: its function, its name in `ObjectiveNam
 """
 
 import functools
-from typing import Literal, NamedTuple, Protocol
+from typing import Annotated, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
-from cmedirl_jax import modes
+from cmedirl_jax import modes, ranges
 from cmedirl_jax.irl.regularisers import masked_mean
 from cmedirl_jax.registries import Registry
 from cmedirl_jax.types import Numeric, RewardBatch
 
-ObjectiveName = Literal["visitation", "transition", "trajectory"]
+ObjectiveName = Annotated[Literal["visitation", "transition", "trajectory"], ranges.Registered]
 """The names in `OBJECTIVES`."""
 
 

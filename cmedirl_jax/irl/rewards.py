@@ -13,13 +13,13 @@ its name in `NetworkName`, and an entry in `NETWORKS`.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cmedirl_jax import checks, grids, modes, networks, normalisation
+from cmedirl_jax import checks, grids, modes, networks, normalisation, ranges
 from cmedirl_jax.normalisation import Normalise
 from cmedirl_jax.ranges import AtLeastTwo, Size
 from cmedirl_jax.registries import Registry
@@ -31,7 +31,7 @@ Inputs = Literal["state-action", "state"]
 Features = Callable[[Array, Array], jax.Array]
 """phi: observation `[..., O]`, action `[..., A]` -> `[..., F]`."""
 
-NetworkName = Literal["deep", "radial-basis", "fourier"]
+NetworkName = Annotated[Literal["deep", "radial-basis", "fourier"], ranges.Registered]
 """The names in `NETWORKS`."""
 
 
@@ -88,11 +88,12 @@ def make(
         normalise: how a deep reward normalises observations; the others need bounds.
 
     Raises:
-        ValueError: for an unknown kind, and as the kind's own function: `mlp`, `radial_basis` or
-            `fourier`.
+        ValueError: for an unknown kind or a setting out of range, and as the kind's own function:
+            `mlp`, `radial_basis` or `fourier`.
         TypeError: if a size or a bound of the specification has a wrong type.
     """
     settings = settings or RewardNetworkSettings()
+    ranges.check(settings)
     inputs = "state" if state_only else settings.inputs
     return NETWORKS[settings.kind].make(spec, settings, inputs, normalise)
 

@@ -75,7 +75,8 @@ class RunConfig:
             where it holds fewer.
         seeds: Independent learners per cell.
         seeds_at_once: Of these, how many train together; the next ones follow, so that memory is
-            theirs. All experts train together: with --experts.seeds fewer are shared. Default: all.
+            theirs. Experts have no blocks: with --experts.seeds fewer train, and learners share
+            them. Default: all.
         seed: Seed of the whole run.
         max_steps: Environment steps per learner.
         max_episodes: Episodes per learner; with max-steps, whichever comes first.

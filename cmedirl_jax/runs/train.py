@@ -126,7 +126,7 @@ def session_of(
             capacity=plan.capacity,
             subset_size=plan.subset_size,
             # Blocks of learners must not have the slots of all experts.
-            least_slots=plan.experts.seeds if plan.demos is None and not plan.seeds_at_once else 0,
+            least_slots=plan.experts.seeds if plan.demos is None and not plan.in_blocks else 0,
             group=plan.group,
             gather=cluster.gather,
         ),
@@ -229,10 +229,10 @@ def _train_experts(
     session: Session, checkpointer: Checkpointer, report: Reporter
 ) -> Demonstrations:
     plan = session.plan
-    # In JAX experts are stepped in groups as learners are, and share what is compiled.
     count = plan.experts.seeds
     if isinstance(plan.env, Env):
-        count = max(plan.seeds_at_once, count) if plan.seeds_at_once else plan.seeds
+        # Experts are stepped in groups as learners are, and share what is compiled where they fit.
+        count = max(plan.seeds_at_once or 0, count) if plan.in_blocks else plan.seeds
     return experts.make_pool(
         session.keys.experts,
         plan.env,

@@ -68,6 +68,11 @@ class Plan(NamedTuple):
     experts: Experts
 
     @property
+    def in_blocks(self) -> bool:
+        """Whether a cell's learners train in blocks, one after the other."""
+        return self.seeds_at_once is not None and self.seeds_at_once < self.seeds
+
+    @property
     def capacity(self) -> int:
         """Transitions in a learner's replay, and in an expert's: they share a program."""
         steps = self.budget.max_steps

@@ -33,7 +33,7 @@ class TaskSettings:
     expert_steps: int = 14_000
 
 
-# The bounds of r_D are the best of 0.02, 0.1, 0.3, 1 and 3 on 16 seeds (docs/tuning.md).
+# Of the bounds of r_D 0.02, 0.1, 0.3, 1 and 3; what they do is in docs/tuning.md.
 _LARGER_REWARD = Settings(reward=IRLHParams(bound=0.3))
 
 # The noise that the car needs would fell the pole at once; returns of 1,000 are scaled to 100.

@@ -43,6 +43,8 @@ def test_a_run_of_another_task_is_not_judged(folder, monkeypatch):
     run = pooled.load(folder)
     other = run._replace(config=run.config | {"env": "PointMass-v0"})
     assert claims.verdicts_on(run) is not None
+    on_host = run._replace(config=run.config | {"env": "gymnasium:MountainCarContinuous-v0"})
+    assert claims.verdicts_on(on_host) is not None
     assert claims.verdicts_on(other) is None
     monkeypatch.setattr(pooled, "load", lambda folder: other)
     with pytest.raises(UserError, match=r"PointMass-v0; the paper's claims are about Mountain"):

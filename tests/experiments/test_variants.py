@@ -3,10 +3,12 @@ import shlex
 import polars as pl
 import pytest
 
+from cmedirl_jax.runs.storage import demonstrations as stored
 from experiments import run_grid, variants
 from experiments.variants import VARIANTS, Variant
 from tests.support import curves
 
+OWN = "--base=--methods me-ddpg"
 SLOW, FAST = [0, 20, 95], [10, 95, 95]
 
 
@@ -55,6 +57,15 @@ def test_every_variant_changes_the_settings_of_its_base():
         assert not variant.base or settings[variant.name] != settings[variant.base]
 
 
+def test_changes_may_be_switches_and_have_spaces():
+    base = "--methods gail"
+    options = variants.Options(base=base, changes=("reward.absorbing,gail.form='log D'",))
+    _, changed = variants.variants_of(options)
+    settings = run_grid.parse(shlex.split(changed.options)).settings
+    assert settings.reward.absorbing
+    assert settings.gail.form == "log D"
+
+
 def test_a_run_that_fails_ends_the_command_with_its_code(monkeypatch):
     codes = iter([0, 3])
     monkeypatch.setattr("experiments.run_grid.execute", lambda *args, **options: next(codes))
@@ -68,17 +79,27 @@ def test_an_unknown_variant_is_refused_in_a_line(capsys):
     assert error.count("\n") == 1
 
 
-def test_changes_of_ones_own_are_variants_of_ones_own_base(monkeypatch):
+def test_changes_of_ones_own_are_variants_of_ones_own_base(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
     run = []
-    monkeypatch.setattr(
-        "experiments.run_grid.execute", lambda _, config, *args, **options: run.append(config) or 0
-    )
+
+    def execute(name, config, *args, **options):
+        # The base's run keeps the demonstrations of its experts.
+        kept = config.out / stored.FOLDER / stored.FILE
+        kept.parent.mkdir(parents=True)
+        kept.touch()
+        run.append(config)
+        return 0
+
+    monkeypatch.setattr("experiments.run_grid.execute", execute)
     monkeypatch.setattr(variants, "compare", lambda *_: pl.DataFrame())
     monkeypatch.setattr(variants, "shown", lambda table: "")
     base = "--base=--env Pendulum-v1 --methods me-ddpg"
     changes = ["reward.bound=0.5", "agent.discount=0.9,reward-schedule.stop=None"]
     assert variants.main([base, "--seeds", "4", "--changes", *changes]) == 0
     assert [config.env for config in run] == ["Pendulum-v1"] * 3
+    pool = run[0].out / stored.FOLDER / stored.FILE
+    assert [config.demos for config in run] == [None, pool, pool]
     assert [config.out.name for config in run] == ["base", *changes]
     first, bound, two = (config.settings for config in run)
     assert bound.reward.bound == 0.5
@@ -93,7 +114,11 @@ def test_changes_of_ones_own_are_variants_of_ones_own_base(monkeypatch):
         ([], "--demos: the study's variants need"),
         (["--changes", "reward.bound=1"], "--base and --changes go together"),
         (["--base=--methods ddpg"], "--base and --changes go together"),
-        (["--base=--n-demos 5", "--changes", "reward.bound=1"], "--base: needs one method"),
+        (["--base=--n-demos 5", "--changes", "reward.bound=1"], "base: needs one method"),
+        ([OWN, "--changes", "n-demos=5 10"], "n-demos=5 10: needs one method"),
+        ([OWN, "--changes", "seed=1"], "seed=1: needs the task and the study seed"),
+        ([OWN, "--changes", "seeds=4"], "seeds=4: give --seeds to this command"),
+        ([OWN, "--changes", "gail.form='log D"], "No closing quotation"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(arguments, message, capsys):

@@ -20,13 +20,19 @@ def slots(seeds_at_once, experts_trained, monkeypatch):
     of_experts = []
     monkeypatch.setattr(experts, "make_pool", lambda *args: of_experts.append(args[3].slots))
     train._train_experts(session, None, None)
-    learners = session.compiled(METHODS["ddpg"], plan.settings, seeds_at_once or 40).slots
+    learners = session.compiled(METHODS["ddpg"], plan.settings, min(seeds_at_once or 40, 40)).slots
     return learners, *of_experts
 
 
 @pytest.mark.parametrize(
     ("at_once", "experts_trained", "expected"),
-    [(None, 16, (40, 40)), (None, 80, (80, 80)), (10, 10, (10, 10)), (10, 40, (10, 40))],
+    [
+        (None, 16, (40, 40)),
+        (None, 80, (80, 80)),
+        (10, 10, (10, 10)),
+        (10, 40, (10, 40)),
+        (1000, 40, (40, 40)),
+    ],
 )
 def test_a_block_of_learners_has_its_own_memory(at_once, experts_trained, expected, monkeypatch):
     assert slots(at_once, experts_trained, monkeypatch) == expected

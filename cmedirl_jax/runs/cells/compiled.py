@@ -234,16 +234,13 @@ def begin(
 
 def abstract(programs: CompiledMethod, data: HotStartData | None, n_demos: int) -> TrainingState:
     """The shapes and dtypes of what `begin` makes."""
-
-    drawn = seeds.keys(jax.random.key(0), programs.slots)
-    first = programs.first(drawn)
-
-    def of_keys(keys: jax.Array) -> TrainingState:
-        episodes = None if data is None else pools.episodes_of(data, np.arange(programs.slots))
-        networks = programs.draw_networks(keys, 1)
-        return programs.init(keys, networks, episodes, first, 1, data, n_demos)
-
-    return jax.eval_shape(of_keys, drawn)
+    keys = seeds.keys(jax.random.key(0), programs.slots)
+    episodes = None if data is None else pools.episodes_of(data, np.arange(programs.slots))
+    # One after the other: JAX refuses compiler options within another tracing.
+    networks = jax.eval_shape(programs.draw_networks, keys, 1)
+    return jax.eval_shape(
+        programs.init, keys, networks, episodes, programs.first(keys), 1, data, n_demos
+    )
 
 
 def pack(

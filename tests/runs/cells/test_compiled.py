@@ -78,6 +78,14 @@ def test_shapes_are_those_of_the_beginning(compiled, method):
     chex.assert_trees_all_equal_shapes_and_dtypes(shapes, state)
 
 
+@pytest.mark.optimised
+def test_shapes_are_known_where_programs_have_compiler_options():
+    compiler = compiled_lib.compiler(ENV, jax.devices()[:1], capacity=50, subset_size=3, group=2)
+    programs = compiler(METHODS["hs-me-ddpg"], SMALL, SEEDS)
+    state = compiled_lib.abstract(programs, POOL, 2)
+    assert state.storage.shape[0] == programs.slots
+
+
 def test_each_learner_draws_from_the_episodes_of_its_row(compiled):
     programs = compiled(METHODS["hs-ddpg"], SMALL, SEEDS)
     slots = Slots(programs.slots, SEEDS, programs.group, programs.devices)
