@@ -1,6 +1,6 @@
 import dataclasses
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
@@ -60,6 +60,12 @@ def test_a_string_that_is_none_of_the_choices_is_refused():
         ("some", "must be one of apple, pear, got 'fig'"),
         ("none", "must be one of apple, pear, got 'nut'"),
     ]
+
+
+def test_names_of_a_registry_are_left_to_it():
+    fruit = Annotated[Literal["apple", "pear"], ranges.Registered]
+    basket = dataclasses.make_dataclass("Basket", [("one", fruit)])
+    assert not list(ranges.out_of_range(basket("plum")))
 
 
 def test_a_range_is_found_in_optional_fields_and_in_tuples():

@@ -2,6 +2,7 @@ import typing
 
 import pytest
 
+from cmedirl_jax import ranges
 from cmedirl_jax.agents import exploration
 from cmedirl_jax.irl import objectives, rewards
 from cmedirl_jax.registries import Registry
@@ -32,4 +33,7 @@ def test_an_added_entry_is_found_and_listed():
     ids=["exploration", "objective", "reward network"],
 )
 def test_the_command_line_offers_every_entry(names, registry):
-    assert typing.get_args(names) == tuple(registry)
+    choices, *marks = typing.get_args(names)
+    assert typing.get_args(choices) == tuple(registry)
+    # Entries of users are not among them, and are not refused.
+    assert ranges.Registered in marks
