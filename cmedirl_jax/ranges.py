@@ -125,20 +125,18 @@ def known(values: Any) -> bool:
 @functools.cache
 def of_fields(settings: type) -> dict[str, Range | None]:
     """The range of each field of a dataclass; None where its annotation has none."""
-    hints = typing.get_type_hints(settings, include_extras=True)
-    return {
-        field.name: next(_ranges_in(hints[field.name]), None)
-        for field in dataclasses.fields(settings)
-    }
+    return {name: next(_ranges_in(hint), None) for name, hint in _annotations(settings).items()}
 
 
 @functools.cache
 def _choices_of(settings: type) -> dict[str, tuple[str, ...]]:
     """The strings that each field of a dataclass may hold; none where it may hold any."""
+    return {name: tuple(_choices_in(hint)) for name, hint in _annotations(settings).items()}
+
+
+def _annotations(settings: type) -> dict[str, Any]:
     hints = typing.get_type_hints(settings, include_extras=True)
-    return {
-        field.name: tuple(_choices_in(hints[field.name])) for field in dataclasses.fields(settings)
-    }
+    return {field.name: hints[field.name] for field in dataclasses.fields(settings)}
 
 
 def _choices_in(annotation: Any) -> Iterator[str]:

@@ -31,7 +31,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from cmedirl_jax.envs import registry
+from cmedirl_jax.envs import split_id
 from cmedirl_jax.runs.console import ending, screen
 from cmedirl_jax.runs.console.options import read
 from cmedirl_jax.runs.errors import UserError
@@ -138,7 +138,7 @@ def verdicts_on(run: Run) -> Verdicts | None:
 
 def _of_the_paper(run: Run) -> bool:
     """Whether its task is the paper's, in JAX or through Gymnasium."""
-    return registry.split_id(run.config["env"])[1] == presets.CAR
+    return split_id(run.config["env"])[1] == presets.CAR
 
 
 def section(claims: Sequence[Claim]) -> str:

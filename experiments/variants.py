@@ -177,7 +177,8 @@ def check(variants: Sequence[Variant]) -> None:
             arguments = shlex.split(variant.options)
         except ValueError as error:
             raise UserError(f"{variant.name}: {error}") from error
-        if ours := {"--demos", "--out", "--seeds"}.intersection(arguments):
+        names = {argument.partition("=")[0] for argument in arguments}
+        if ours := names & {"--demos", "--out", "--seeds"}:
             raise UserError(f"{variant.name}: give {ours.pop()} to this command, for all variants")
         config = run_grid.parse(arguments)
         if len(config.methods) * len(config.n_demos) != 1:

@@ -114,6 +114,7 @@ def session_of(
     cluster: Cluster,
 ) -> Session:
     """The session of a run; its programs are compiled at their first use."""
+    in_one_block = plan.together == plan.seeds
     return Session(
         plan,
         Keys(*jax.random.split(jax.random.key(plan.study), 3)),
@@ -126,7 +127,7 @@ def session_of(
             capacity=plan.capacity,
             subset_size=plan.subset_size,
             # Blocks of learners must not have the slots of all experts.
-            least_slots=plan.experts.seeds if plan.demos is None and not plan.in_blocks else 0,
+            least_slots=plan.experts.seeds if in_one_block and plan.demos is None else 0,
             group=plan.group,
             gather=cluster.gather,
         ),
@@ -232,7 +233,7 @@ def _train_experts(
     count = plan.experts.seeds
     if isinstance(plan.env, Env):
         # Experts are stepped in groups as learners are, and share what is compiled where they fit.
-        count = max(plan.seeds_at_once or 0, count) if plan.in_blocks else plan.seeds
+        count = plan.seeds if plan.together == plan.seeds else max(plan.together, count)
     return experts.make_pool(
         session.keys.experts,
         plan.env,

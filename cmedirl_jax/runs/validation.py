@@ -68,9 +68,9 @@ class Plan(NamedTuple):
     experts: Experts
 
     @property
-    def in_blocks(self) -> bool:
-        """Whether a cell's learners train in blocks, one after the other."""
-        return self.seeds_at_once is not None and self.seeds_at_once < self.seeds
+    def together(self) -> int:
+        """How many learners of a cell train together; the others follow in blocks."""
+        return min(self.seeds_at_once or self.seeds, self.seeds)
 
     @property
     def capacity(self) -> int:

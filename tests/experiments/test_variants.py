@@ -117,6 +117,10 @@ def test_changes_of_ones_own_are_variants_of_ones_own_base(monkeypatch, tmp_path
         (["--base=--n-demos 5", "--changes", "reward.bound=1"], "base: needs one method"),
         ([OWN, "--changes", "n-demos=5 10"], "n-demos=5 10: needs one method"),
         ([OWN, "--changes", "seed=1"], "seed=1: needs the task and the study seed"),
+        (
+            ["--base=--methods me-ddpg --seeds=4", "--changes", "reward.bound=1"],
+            "base: give --seeds",
+        ),
         ([OWN, "--changes", "seeds=4"], "seeds=4: give --seeds to this command"),
         ([OWN, "--changes", "gail.form='log D"], "No closing quotation"),
     ],
