@@ -68,7 +68,7 @@ def devices() -> list[Any]:
     """This process's devices; starts JAX.
 
     Raises:
-        UserError: if the platform that JAX_PLATFORMS asks for is not here.
+        UserError: if the platform that JAX_PLATFORMS asks for is not here, or JAX cannot start.
     """
     try:
         return jax.local_devices()
@@ -76,8 +76,10 @@ def devices() -> list[Any]:
     except (RuntimeError, AssertionError) as error:
         asked = jax.config.jax_platforms  # pyright: ignore[reportAttributeAccessIssue]
         reason = " ".join(str(error).split()) or "it is not installed, or has no device"
+        if not asked:
+            raise UserError(f"JAX cannot start here: {reason}") from error
         raise UserError(
-            f"JAX_PLATFORMS={asked or ''}: JAX finds no such platform here ({reason}); "
+            f"JAX_PLATFORMS={asked}: JAX finds no such platform here ({reason}); "
             "give another, or cpu"
         ) from error
 

@@ -2,6 +2,7 @@ import os
 import platform
 import subprocess
 import sys
+import types
 
 import pytest
 
@@ -96,14 +97,21 @@ def test_a_core_is_for_as_many_seeds_as_are_asked(monkeypatch):
         (RuntimeError("Unable to initialize\nbackend 'cuda'"), "Unable to initialize backend "),
     ],
 )
-def test_a_platform_that_is_not_here_is_refused(monkeypatch, error, reason):
+@pytest.mark.parametrize(
+    ("asked", "beginning"),
+    [
+        ("cuda", "JAX_PLATFORMS=cuda: JAX finds no such platform here ("),
+        ("", "JAX cannot start here: "),
+    ],
+)
+def test_a_platform_that_is_not_here_is_refused(monkeypatch, asked, beginning, error, reason):
     def local_devices():
         raise error
 
     monkeypatch.setattr(start.jax, "local_devices", local_devices)
+    monkeypatch.setattr(start.jax, "config", types.SimpleNamespace(jax_platforms=asked))
     with pytest.raises(UserError) as refusal:
-        start.start(ClusterOptions(), None, 1, {})
+        start.devices()
     line = str(refusal.value)
-    assert line.startswith("JAX_PLATFORMS=")
-    assert f": JAX finds no such platform here ({reason}" in line
+    assert line.startswith(beginning + reason)
     assert "\n" not in line
