@@ -54,6 +54,9 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_collection_finish():
+    # Hypothesis makes its generator at its first example, and warns of one that only frozen objects
+    # refer to.
+    hypothesis.given(hypothesis.strategies.none())(lambda _: None)()
     # Modules stay until the end: the collector need not look through them again and again.
     gc.collect()
     gc.freeze()

@@ -52,6 +52,6 @@ def test_an_update_has_the_same_numbers(env):
         terminated=jnp.arange(32) == 3,
     )
     usual = compiling.jit_as_users(agent.update)(state, batch)
-    emitters = {"xla_cpu_use_fusion_emitters": True}
-    less = jax.jit(agent.update, compiler_options=emitters | {compilation._LEVEL: 1})(state, batch)
+    level = {compilation._LEVEL: 1}
+    less = compiling.jit_as_users(agent.update, compiler_options=level)(state, batch)
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-7), usual, less)

@@ -94,7 +94,8 @@ def transformed(function):
     def scanned(*given):
         return jax.lax.scan(lambda _, each: (None, jax.vmap(function)(*each)), None, given)[1]
 
-    split, mesh = jax.P(None, "seeds"), jax.sharding.AbstractMesh((2,), ("seeds",))
+    automatic = (jax.sharding.AxisType.Auto,)
+    split, mesh = jax.P(None, "seeds"), jax.sharding.AbstractMesh((2,), ("seeds",), automatic)
     return jax.jit(jax.shard_map(scanned, mesh=mesh, in_specs=split, out_specs=split))
 
 

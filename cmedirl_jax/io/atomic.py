@@ -53,9 +53,22 @@ def check_writable(folder: Path) -> None:
     Raises:
         OSError: if they cannot.
     """
-    nearest = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    nearest = next(path for path in (folder, *folder.absolute().parents) if exists(path))
     with tempfile.TemporaryFile(dir=nearest):
         pass
+
+
+def exists(path: Path) -> bool:
+    """Whether there is a file or folder: as `Path.exists`, which hides errors in newer Pythons.
+
+    Raises:
+        OSError: if it cannot be told, as for a name that is too long.
+    """
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
 
 
 def flush(path: Path) -> None:

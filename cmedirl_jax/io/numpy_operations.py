@@ -18,7 +18,7 @@ def dtype_name(dtype: Any) -> str:
 
 
 Write = Callable[..., str]
-"""`(equation, *argument expressions) -> expression`."""
+"""`(equation, *argument expressions) -> expression`, of as many values as there are results."""
 
 
 def _call(function: str) -> Write:
@@ -48,6 +48,11 @@ def _broadcast(equation: Any, x: str) -> str:
 
 def _reshape(equation: Any, x: str) -> str:
     return f"np.reshape({x}, {shape_text(equation.outvars[0].aval.shape)})"
+
+
+def _unstack(equation: Any, x: str) -> str:
+    parts = f"np.moveaxis({x}, {equation.params['axis']}, 0)"
+    return parts if len(equation.outvars) > 1 else f"{parts}[0]"
 
 
 def _convert(equation: Any, x: str) -> str:
@@ -189,6 +194,10 @@ OPERATIONS: dict[str, Write] = {
     "squeeze": _reshape,
     "expand_dims": _reshape,
     "transpose": lambda equation, x: f"np.transpose({x}, {tuple(equation.params['permutation'])})",
+    "unstack": _unstack,
+    "stack": lambda equation, *parts: (
+        f"np.stack(({', '.join(parts)},), axis={equation.params['axis']})"
+    ),
     "concatenate": lambda equation, *parts: (
         f"np.concatenate(({', '.join(parts)},), axis={equation.params['dimension']})"
     ),

@@ -151,14 +151,14 @@ class _Lines:
             return self.inline(inner, arguments)
         if kind not in OPERATIONS:
             raise ValueError(f"numpy's file has no {kind}, which the function uses")
-        (result,) = equation.outvars
-        text, dtype = OPERATIONS[kind](equation, *arguments), result.aval.dtype
-        if dtype.kind in "iu":
+        text, results = OPERATIONS[kind](equation, *arguments), equation.outvars
+        if len(results) == 1 and (dtype := results[0].aval.dtype).kind in "iu":
             # Numpy counts and sums integers in 64 bits.
             text = f"np.asarray({text}).astype({dtype_name(dtype)})"
-        self._count += 1
-        self.add(f"_v{self._count} = {text}")
-        return [f"_v{self._count}"]
+        names = [f"_v{self._count + index}" for index in range(1, len(results) + 1)]
+        self._count += len(results)
+        self.add(f"{', '.join(names)} = {text}")
+        return names
 
 
 def _literal(of: Any) -> str:

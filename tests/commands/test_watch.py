@@ -8,6 +8,14 @@ from cmedirl_jax.commands import watch
 from cmedirl_jax.commands.cmedirl import main
 
 
+@pytest.fixture(autouse=True)
+def environment(monkeypatch):
+    """What the command sets for the libraries that draw is unset again: MuJoCo reads it too."""
+    for name in ("SDL_VIDEODRIVER", "MUJOCO_GL"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+
+
 def test_the_command_films_an_episode(untrained_run, tmp_path, capsys):
     out = tmp_path / "film.gif"
     options = ["--method", "hs-ddpg", "--n-demos", "7", "--every", "400", "--width", "60"]

@@ -20,7 +20,7 @@ def check(option: str, path: Path | None) -> None:
     if path is None:
         return
     try:
-        if path.is_dir():
+        if atomic.exists(path) and path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         atomic.check_writable(path.parent)
     except OSError as error:

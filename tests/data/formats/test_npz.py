@@ -294,7 +294,9 @@ def test_sizes_that_the_archives_directory_exaggerates_too_are_refused_unread(pa
         entry.file_size = len(array) - 32 + 10**9 - 30
         entry.compress_size = 10**9
     monkeypatch.setattr(npz, "_read_array", lambda *_: pytest.fail("it is read"))
-    with pytest.raises(ValueError, match=r"pool\.npz: .*reward\.npy claims \d+ bytes"):
+    # Newer Pythons see themselves that the entry would reach into the next one.
+    refusal = r"reward\.npy claims \d+ bytes|Overlapped entries: 'reward\.npy'"
+    with pytest.raises(ValueError, match=rf"pool\.npz: .*({refusal})"):
         demonstrations.load(path)
 
 

@@ -10,6 +10,7 @@ def test_a_file_that_could_not_be_written_is_refused_and_nothing_is_left(tmp_pat
         (tmp_path, "Is a directory"),
         (tmp_path / "file" / "new" / "table.csv", "Not a directory"),
         (tmp_path / ("x" * 300) / "table.csv", "File name too long"),
+        (tmp_path / ("x" * 300), "File name too long"),
     ):
         with pytest.raises(UserError) as refusal:
             outputs.check("out", path)
