@@ -86,7 +86,8 @@ def write(
         lines.add(f"{each} = _rows({each}, {size}, {'None' if each == first else '_leading'})")
     lines.add(f"{_BATCH} = len({first})")
     (result,) = lines.inline(closed.jaxpr, [*names, *inputs])
-    (shape,) = (variable.aval.shape[1:] for variable in closed.jaxpr.outvars)
+    variable: Any = closed.jaxpr.outvars[0]
+    shape = variable.aval.shape[1:]
     lines.add(
         f"return np.asarray({result}, np.float32).reshape({shape_text(['*_leading', *shape])})"
     )
@@ -145,10 +146,8 @@ class _Lines:
         kind = equation.primitive.name
         if kind in _INLINED:
             inner = equation.params.get("jaxpr") or equation.params["call_jaxpr"]
-            if isinstance(inner, core.ClosedJaxpr):
-                constants = [self.constant(value) for value in inner.consts]
-                return self.inline(inner.jaxpr, [*constants, *arguments])
-            return self.inline(inner, arguments)
+            constants = [self.constant(value) for value in getattr(inner, "consts", ())]
+            return self.inline(getattr(inner, "jaxpr", inner), [*constants, *arguments])
         if kind not in OPERATIONS:
             raise ValueError(f"numpy's file has no {kind}, which the function uses")
         text, results = OPERATIONS[kind](equation, *arguments), equation.outvars
