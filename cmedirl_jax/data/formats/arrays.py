@@ -165,6 +165,8 @@ def of_d4rl_file(source: Any, env: str | EnvSpec | None) -> Demonstrations:
         with h5py.File(source) as file:
             there: list[Any] = [(name, file.get(name)) for name in (*_D4RL, *_D4RL_OPTIONAL)]
             found = {name: array[()] for name, array in there if array is not None}
+    except PermissionError:
+        raise
     except Exception as error:
         raise damaged(error) from error
     return of_d4rl(found, env)
@@ -178,12 +180,18 @@ TRAJECTORIES = Format(
     "a list of dictionaries with observations, actions, rewards, terminated",
     lambda source: isinstance(source, Sequence) and not isinstance(source, str),
     of_trajectories,
+    in_memory=True,
 )
 IMITATION = Format("imitation's npz", _holds("obs", "acts", "indices"), of_imitation)
 STABLE_BASELINES = Format(
     "stable-baselines' npz", _holds("obs", "actions", "episode_starts"), of_stable_baselines
 )
-D4RL = Format("a dictionary of d4rl's arrays", lambda source: isinstance(source, Mapping), of_d4rl)
+D4RL = Format(
+    "a dictionary of d4rl's arrays",
+    lambda source: isinstance(source, Mapping),
+    of_d4rl,
+    in_memory=True,
+)
 D4RL_FILE = Format(
     "an npz or HDF5 file of d4rl's arrays",
     lambda source: is_file(source, ".hdf5", ".h5") or _holds(*_D4RL)(source),

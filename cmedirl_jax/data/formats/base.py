@@ -40,6 +40,7 @@ class Format(NamedTuple):
             format does not take, OSError where it cannot be written, ModuleNotFoundError where a
             package is missing.
         package: the extra that it needs; None for none.
+        in_memory: whether its sources are objects, and no paths or ids.
     """
 
     description: str
@@ -48,6 +49,7 @@ class Format(NamedTuple):
     writes: Callable[[str], bool] | None = None
     write: Callable[[str, Demonstrations, EnvSpec], Any] | None = None
     package: str | None = None
+    in_memory: bool = False
 
 
 def is_file(source: Any, *endings: str) -> bool:

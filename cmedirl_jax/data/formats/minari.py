@@ -45,6 +45,7 @@ def from_minari(source: str | Path, env: str | EnvSpec | None = None) -> Demonst
         ValueError: if it is damaged, for spaces that are no boxes of one axis, an episode that goes
             on after its end, or if nothing names the environment.
         FileNotFoundError: if there is no such dataset here.
+        PermissionError: if it may not be read.
         ModuleNotFoundError: without the extra `minari`.
     """
     import minari  # type: ignore[import-not-found]
@@ -61,6 +62,8 @@ def from_minari(source: str | Path, env: str | EnvSpec | None = None) -> Demonst
         raise FileNotFoundError(
             f"Minari has no dataset {source} here; fetch it by: minari download {source}"
         ) from error
+    except PermissionError:
+        raise
     except Exception as error:
         raise damaged(error) from error
     known = dataset.storage.metadata

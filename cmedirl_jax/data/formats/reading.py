@@ -82,13 +82,16 @@ def parse(
         env: the task's name, or its specification, which state-only demonstrations need.
 
     Raises:
-        ValueError: for an unknown format or a source that no format recognises. For a damaged or
-            inconsistent one, naming the source and the format it was read as.
+        ValueError: for an unknown format, one that is for other sources, or a source that no format
+            recognises. For a damaged or inconsistent one, naming the source and the format it was
+            read as.
         OSError: if a file cannot be read, or is not there.
         ModuleNotFoundError: naming the extra that the format needs.
     """
     name = recognised(source) if format is None else format
     chosen, shown = FORMATS[name], _shown(source)
+    if isinstance(source, str | Path) == chosen.in_memory:
+        raise ValueError(f"{shown}: format {name} is {chosen.description}; give another")
     try:
         pool = chosen.read(source, env)
         validation.validate(pool)

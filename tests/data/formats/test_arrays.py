@@ -23,3 +23,15 @@ def test_no_pickle_is_ever_loaded(tmp_path):
     np.savez(path, **arrays)
     with pytest.raises(ValueError, match=r"read as imitation, it is damaged .*pickled objects"):
         demonstrations.read(path, env=SPEC)
+
+
+def test_a_file_that_may_not_be_read_is_not_called_damaged(monkeypatch, tmp_path):
+    h5py = pytest.importorskip("h5py")
+
+    def refuse(*arguments, **options):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(h5py, "File", refuse)
+    (tmp_path / "closed.hdf5").touch()
+    with pytest.raises(PermissionError, match="Permission denied"):
+        demonstrations.read(tmp_path / "closed.hdf5", format="d4rl-file")

@@ -118,3 +118,14 @@ def test_a_dataset_that_cannot_be_written_leaves_nothing(monkeypatch):
         demonstrations.to_minari(as_pool(episodes()), "test/broken-v0", spec=SPEC, **facts)
     assert not storage.get_dataset_path("test/broken-v0").exists()
     demonstrations.to_minari(as_pool(episodes()), "test/broken-v0", spec=SPEC, **FACTS)
+
+
+def test_a_dataset_that_may_not_be_read_is_not_called_damaged(monkeypatch):
+    minari = pytest.importorskip("minari")
+
+    def refuse(*arguments, **options):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(minari, "load_dataset", refuse)
+    with pytest.raises(PermissionError, match="Permission denied"):
+        demonstrations.from_minari("test/closed-v0")

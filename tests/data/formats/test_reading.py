@@ -174,6 +174,9 @@ def test_what_nobody_knows_is_refused_with_what_there_is(tmp_path):
         demonstrations.read(other, "pickle")
     with pytest.raises(ValueError, match="read as d4rl-file, it has no array 'observations'"):
         demonstrations.read(other, "d4rl-file")
+    for source, name in ((other, "d4rl"), (str(other), "trajectories"), ({"obs": 1}, "minari")):
+        with pytest.raises(ValueError, match=f": format {name} is .*; give another"):
+            demonstrations.read(source, name)
     with pytest.raises(ValueError, match="it does not name its task: give env; give format if"):
         demonstrations.read(as_csv(episodes(), tmp_path / "pool"))
     with pytest.raises(FileNotFoundError, match="there is no file none"):
