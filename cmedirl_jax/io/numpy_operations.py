@@ -1,5 +1,6 @@
 """The operations of a JAX function's trace, each as an expression of numpy."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -51,7 +52,15 @@ def _reshape(equation: Any, x: str) -> str:
 
 
 def _unstack(equation: Any, x: str) -> str:
-    parts = f"np.moveaxis({x}, {equation.params['axis']}, 0)"
+    return _results(equation, f"np.moveaxis({x}, {equation.params['axis']}, 0)")
+
+
+def _split(equation: Any, x: str) -> str:
+    ends = list(itertools.accumulate(equation.params["sizes"]))[:-1]
+    return _results(equation, f"np.split({x}, {ends}, axis={equation.params['axis']})")
+
+
+def _results(equation: Any, parts: str) -> str:
     return parts if len(equation.outvars) > 1 else f"{parts}[0]"
 
 
@@ -195,6 +204,7 @@ OPERATIONS: dict[str, Write] = {
     "expand_dims": _reshape,
     "transpose": lambda equation, x: f"np.transpose({x}, {tuple(equation.params['permutation'])})",
     "unstack": _unstack,
+    "split": _split,
     "stack": lambda equation, *parts: (
         f"np.stack(({', '.join(parts)},), axis={equation.params['axis']})"
     ),

@@ -25,6 +25,7 @@ OPERATIONS = {
     "constants of its own": lambda x: x + jax.jit(lambda: jnp.arange(3.0) * TABLE)(),
     "norm": lambda x: x * jax.lax.rsqrt(jnp.mean(x**2, -1, keepdims=True) + 1e-3),
     "parts": lambda x: jnp.stack([*jnp.unstack(x, axis=1), *jnp.unstack(x[:, :1], axis=1)], axis=1),
+    "uneven parts": lambda x: jnp.concatenate(jnp.split(x, [1], axis=1)[::-1], axis=1),
     "no batch": lambda x: jnp.broadcast_to(jnp.float32(jnp.nan), x.shape),
 }
 
