@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cmedirl_jax.data.formats.base import Format, damaged, is_file, named
+from cmedirl_jax.data.formats.base import Format, is_file, named, naming_damage
 from cmedirl_jax.data.trajectories import from_trajectories
 from cmedirl_jax.io import npz
 from cmedirl_jax.types import Demonstrations, EnvSpec
@@ -41,12 +41,8 @@ def read_npz(path: str | Path, wanted: Sequence[str], optional: Sequence[str] = 
     missing = [name for name in wanted if name not in present]
     if missing:
         raise ValueError(f"it has no array {missing[0]!r}")
-    try:
+    with naming_damage(OSError):
         return npz.read(Path(path), [*wanted, *(name for name in optional if name in present)])
-    except OSError:
-        raise
-    except Exception as error:
-        raise damaged(error) from error
 
 
 def cut(length: int, ends: np.ndarray) -> list[slice]:
@@ -161,14 +157,9 @@ def of_d4rl_file(source: Any, env: str | EnvSpec | None) -> Demonstrations:
         return of_d4rl(read_npz(source, _D4RL, _D4RL_OPTIONAL), env)
     import h5py  # type: ignore[import-not-found]
 
-    try:
-        with h5py.File(source) as file:
-            there: list[Any] = [(name, file.get(name)) for name in (*_D4RL, *_D4RL_OPTIONAL)]
-            found = {name: array[()] for name, array in there if array is not None}
-    except PermissionError:
-        raise
-    except Exception as error:
-        raise damaged(error) from error
+    with naming_damage(PermissionError), h5py.File(source) as file:
+        there: list[Any] = [(name, file.get(name)) for name in (*_D4RL, *_D4RL_OPTIONAL)]
+        found = {name: array[()] for name, array in there if array is not None}
     return of_d4rl(found, env)
 
 

@@ -1,6 +1,7 @@
 """What a format of demonstrations is."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -60,9 +61,22 @@ def is_file(source: Any, *endings: str) -> bool:
     return path.suffix.lower() in endings and path.is_file()
 
 
-def damaged(error: Exception) -> ValueError:
-    """The refusal of a file for which its reader raised something, which may be anything."""
-    return ValueError(f"it is damaged ({' '.join(str(error).split())[:200]})")
+@contextlib.contextmanager
+def naming_damage(*others: type[Exception]) -> Iterator[None]:
+    """Call a source damaged for which its reader raises something, which may be anything.
+
+    Args:
+        *others: errors that say nothing of damage, and stay as they are.
+
+    Raises:
+        ValueError: in place of the reader's error.
+    """
+    try:
+        yield
+    except others:
+        raise
+    except Exception as error:
+        raise ValueError(f"it is damaged ({' '.join(str(error).split())[:200]})") from error
 
 
 def named(env: str | EnvSpec | None) -> str | EnvSpec:

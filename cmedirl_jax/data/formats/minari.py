@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from cmedirl_jax.data.formats.base import Format, damaged, named
+from cmedirl_jax.data.formats.base import Format, named, naming_damage
 from cmedirl_jax.data.trajectories import from_trajectories
 from cmedirl_jax.data.validation import absent
 from cmedirl_jax.envs import split_id
@@ -52,20 +52,17 @@ def from_minari(source: str | Path, env: str | EnvSpec | None = None) -> Demonst
 
     folder = Path(source) / "data"
     try:
-        dataset = (
-            minari.MinariDataset(folder)
-            if folder.is_dir()
-            else minari.load_dataset(str(source), download=False)
-        )
-        episodes = list(dataset.iterate_episodes())
+        with naming_damage(FileNotFoundError, PermissionError):
+            dataset = (
+                minari.MinariDataset(folder)
+                if folder.is_dir()
+                else minari.load_dataset(str(source), download=False)
+            )
+            episodes = list(dataset.iterate_episodes())
     except FileNotFoundError as error:
         raise FileNotFoundError(
             f"Minari has no dataset {source} here; fetch it by: minari download {source}"
         ) from error
-    except PermissionError:
-        raise
-    except Exception as error:
-        raise damaged(error) from error
     known = dataset.storage.metadata
     kept: dict[str, Any] = {name: known[name] for name in ("dataset_id", *FACTS) if name in known}
     kept = {name: list(x) if isinstance(x, set | tuple) else x for name, x in kept.items()}

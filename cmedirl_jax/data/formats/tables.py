@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from cmedirl_jax.data.formats.base import Format, damaged, is_file, named
+from cmedirl_jax.data.formats.base import Format, is_file, named, naming_damage
 from cmedirl_jax.data.trajectories import from_trajectories
 from cmedirl_jax.data.validation import absent
 from cmedirl_jax.io import atomic
@@ -35,12 +35,8 @@ def of_table(source: Any, env: str | EnvSpec | None) -> Demonstrations:
     import polars as pl
 
     read = pl.read_csv if str(source).lower().endswith(".csv") else pl.read_parquet
-    try:
+    with naming_damage(OSError):
         table = read(Path(source).read_bytes())
-    except OSError:
-        raise
-    except Exception as error:
-        raise damaged(error) from error
     return _of_columns({name: table[name].to_numpy() for name in table.columns}, named(env))
 
 
@@ -171,12 +167,8 @@ def of_imitation_folder(source: Any, env: str | EnvSpec | None) -> Demonstration
     files = sorted(Path(source).glob("*.arrow"))
     if not files:
         raise ValueError("it holds no .arrow file")
-    try:
+    with naming_damage(OSError):
         table = pl.concat([pl.read_ipc_stream(file.read_bytes()) for file in files])
-    except OSError:
-        raise
-    except Exception as error:
-        raise damaged(error) from error
     missing = [name for name in ("obs", "acts", "terminal") if name not in table.columns]
     if missing:
         raise ValueError(f"it has no column {missing[0]!r}")
