@@ -152,7 +152,7 @@ class _Lines:
             raise ValueError(f"numpy's file has no {kind}, which the function uses")
         text, results = OPERATIONS[kind](equation, *arguments), equation.outvars
         if len(results) == 1 and (dtype := results[0].aval.dtype).kind in "iu":
-            # Numpy counts and sums integers in 64 bits.
+            # Numpy counts and sums integers in 64 bits; parts of an array keep their type.
             text = f"np.asarray({text}).astype({dtype_name(dtype)})"
         names = [f"_v{self._count + index}" for index in range(1, len(results) + 1)]
         self._count += len(results)

@@ -109,9 +109,10 @@ def test_a_platform_that_is_not_here_is_refused(monkeypatch, asked, beginning, e
         raise error
 
     monkeypatch.setattr(start.jax, "local_devices", local_devices)
-    monkeypatch.setattr(start.jax, "config", types.SimpleNamespace(jax_platforms=asked))
+    config = types.SimpleNamespace(jax_platforms=asked, update=lambda *_: None)
+    monkeypatch.setattr(start.jax, "config", config)
     with pytest.raises(UserError) as refusal:
-        start.devices()
+        start.start(ClusterOptions(), None, 1, {})
     line = str(refusal.value)
     assert line.startswith(beginning + reason)
     assert "\n" not in line
